@@ -1,0 +1,68 @@
+"""Worlds by name."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+from peps_envs import navigation
+from peps_envs.interface import Environment
+
+
+class Task(NamedTuple):
+    """A world with the numbers that make it a task: what is true, and what a human may believe."""
+
+    environment: Environment
+    params: Any
+    beliefs: dict[str, Any]  # by name; the first one is the default
+
+    @property
+    def default_belief(self) -> str:
+        return next(iter(self.beliefs))
+
+
+_TASKS: dict[str, Callable[[], Task]] = {}
+
+
+def register(name: str, make_task: Callable[[], Task]) -> None:
+    """Makes a task available under `name`, for `Config(env=name)` and every command line.
+
+    Raises:
+      ValueError: the name is taken.
+    """
+    if name in _TASKS:
+        raise ValueError(f"env {name!r} is registered already; choose another name")
+    _TASKS[name] = make_task
+
+
+def names() -> tuple[str, ...]:
+    """The names that `make` knows."""
+    return tuple(_TASKS)
+
+
+def make(name: str) -> Task:
+    """The task called `name`.
+
+    Raises:
+      ValueError: no such name; the message says the nearest.
+    """
+    if name not in _TASKS:
+        raise ValueError(unknown_name("env", name, _TASKS))
+    return _TASKS[name]()
+
+
+def unknown_name(field: str, name: str, known: Iterable[str]) -> str:
+    """One line for a name that doesn't exist: the field, the value, the nearest right one, and all of them."""
+    known = list(known)
+    nearest = difflib.get_close_matches(str(name), known, n=1, cutoff=0.4)
+    hint = f"did you mean {nearest[0]!r}? " if nearest else ""
+    return f"{field} {name!r} is unknown: {hint}known are {', '.join(known)}"
+
+
+def _navigation(domain: str) -> Callable[[], Task]:
+    return lambda: Task(navigation.Navigation(), *navigation.domain(domain))
+
+
+for _domain in navigation.DOMAINS:
+    register(f"nav-{_domain}", _navigation(_domain))

@@ -1,0 +1,131 @@
+"""Evaluation: episodes of a policy, scored by the explicability metric."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+import peps_envs
+from peps_jax import explicability
+from peps_jax.config import Config
+from peps_jax.explicability import Score
+from peps_jax.train import Result
+
+Policy = Callable[[Array, Array | None], tuple[Array, Array]]  # (observation, key or None) -> action, l_pi
+
+
+@struct.dataclass
+class Evaluation:
+    """Episodes, one entry each: (num_episodes,). Events of the world are attributes too, e.g. `goal_reached`."""
+
+    score: Score
+    log_policy: Array  # sum of log pi(a|s) relative to the uniform policy
+    length: Array  # steps
+    events: dict[str, Array]  # bool
+    perceived: Array  # (num_episodes, horizon + 1, perceived_size) the route; the last place is repeated after the end
+
+    @property
+    def return_(self) -> Array:
+        """sum r_A."""
+        return self.score.return_
+
+    @property
+    def human_return(self) -> Array:
+        """sum r_H."""
+        return self.score.human_return
+
+    @property
+    def log_belief(self) -> Array:
+        """sum l_H."""
+        return self.score.log_belief
+
+    @property
+    def log_true(self) -> Array:
+        """sum l_A."""
+        return self.score.log_true
+
+    @property
+    def belief_gap(self) -> Array:
+        """sum (l_H - l_A)."""
+        return self.score.belief_gap
+
+    @property
+    def explicability(self) -> Array:
+        """sum r_H + sum (l_H - l_A)."""
+        return self.score.explicability
+
+    @property
+    def explicability_with_policy(self) -> Array:
+        """The whole of Eq. (4): explicability - sum l_pi."""
+        return self.score.explicability - self.log_policy
+
+    def __getattr__(self, name: str) -> Array:
+        events = self.__dict__.get("events", {})
+        if name in events:
+            return events[name]
+        raise AttributeError(f"Evaluation has no {name!r}; this world's events are {', '.join(events)}")
+
+
+def evaluate(
+    result: Result, config: Config, num_episodes: int = 100, *, stochastic: bool = False, key: Array | None = None
+) -> Evaluation:
+    """Rolls out a learned policy and scores it. Pure.
+
+    Args:
+      result: of `train`.
+      config: world, belief and seed to evaluate in; usually the training's.
+      num_episodes: how many.
+      stochastic: act by samples instead of the policy's mode.
+      key: random key; by default one that follows from `config.seed` and differs from the training's.
+    """
+    environment, params, belief = config.task()
+    key = jax.random.fold_in(jax.random.key(config.seed), 1) if key is None else key
+    return evaluate_policy(result.policy(), environment, params, belief, key, num_episodes, stochastic=stochastic)
+
+
+def evaluate_policy(
+    policy: Policy,
+    environment: peps_envs.Environment,
+    params: Any,
+    belief: Any,
+    key: Array,
+    num_episodes: int,
+    *,
+    stochastic: bool = False,
+) -> Evaluation:
+    """`num_episodes` episodes of `policy` in `params`, scored for a human who believes `belief`."""
+
+    def step(carry: tuple[Any, Array, Array], key: Array) -> tuple[tuple[Any, Array, Array], Any]:
+        state, observation, alive = carry
+        key_act, key_env = jax.random.split(key)
+        action, log_policy = policy(observation, key_act if stochastic else None)
+        after = environment.step(key_env, state, action, params)
+        score = explicability.score(environment, params, belief, state, action, after.state)
+        hold = lambda new, old: jax.tree.map(lambda new, old: jnp.where(alive, new, old), new, old)
+        next_state, next_observation = hold(after.state, state), hold(after.observation, observation)
+        still = alive & ~(after.terminated | after.truncated)
+        row = (score, log_policy, jnp.ones(()), after.events)
+        row = jax.tree.map(lambda values: jnp.where(alive, values, jnp.zeros_like(values)), row)
+        return (next_state, next_observation, still), (row, environment.perceive(next_state))
+
+    def episode(key: Array) -> Evaluation:
+        key_reset, key_steps = jax.random.split(key)
+        state, observation = environment.reset(key_reset, params)
+        keys = jax.random.split(key_steps, environment.horizon)
+        _, (rows, places) = jax.lax.scan(step, (state, observation, jnp.ones((), bool)), keys)
+        score, log_policy, length = jax.tree.map(lambda values: jnp.sum(values, 0), rows[:3])
+        events = jnp.any(rows[3], 0)
+        return Evaluation(
+            score=score,
+            log_policy=log_policy,
+            length=length,
+            events={name: events[i] for i, name in enumerate(environment.event_names)},
+            perceived=jnp.concatenate([environment.perceive(state)[None], places]),
+        )
+
+    return jax.vmap(episode)(jax.random.split(key, num_episodes))

@@ -1,0 +1,75 @@
+"""The explicability metric, Definition 2 and Eq. (3)-(4), transition by transition.
+
+Per episode, with undiscounted sums over its steps,
+
+    explicability = sum r_H + sum (l_H - l_A),
+
+where l_H and l_A are the log-densities of the perceived next state under the belief and under the true dynamics, relative to
+the perceptual kernel. The whole of Eq. (4) also subtracts the policy's term sum l_pi, relative to the uniform policy.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+import peps_envs
+from peps_jax.parts import human
+
+
+class Score(NamedTuple):
+    """What a transition, or the sum over an episode, is worth to agent and human."""
+
+    return_: Array  # sum r_A
+    human_return: Array  # sum r_H
+    log_belief: Array  # sum l_H
+    log_true: Array  # sum l_A
+
+    @property
+    def belief_gap(self) -> Array:
+        """sum (l_H - l_A): how much less the human expected what happened than the truth did."""
+        return self.log_belief - self.log_true
+
+    @property
+    def explicability(self) -> Array:
+        """sum r_H + sum (l_H - l_A)."""
+        return self.human_return + self.belief_gap
+
+
+def score(
+    environment: peps_envs.Environment, params: Any, belief: Any, state: Any, action: Array, next_state: Any
+) -> Score:
+    """The score of one transition; every field is ()."""
+    log_belief, human_reward = human.log_weight(environment, belief, state, action, next_state)
+    expected = environment.next_state_distribution(state, action, params)
+    return Score(
+        return_=environment.reward(state, action, next_state, params),
+        human_return=human_reward,
+        log_belief=log_belief,
+        log_true=expected.relative_log_prob(environment.perceive(next_state)),
+    )
+
+
+def episode_sums(values: Any, over: Array, running: Any) -> tuple[Any, Any]:
+    """Sums since each episode's start.
+
+    Args:
+      values: pytree of (steps, n), one for each transition.
+      over: (steps, n) bool, whether an episode ended with the transition.
+      running: pytree of (n,), sums carried in from before.
+
+    Returns:
+      sums: pytree of (steps, n), which at the transitions where `over` holds are the episodes' totals.
+      running: sums of the episodes that go on.
+    """
+
+    def add(running: Any, step: tuple[Any, Array]) -> tuple[Any, Any]:
+        value, over = step
+        total = jax.tree.map(jnp.add, running, value)
+        return jax.tree.map(lambda sums: jnp.where(over, 0.0, sums), total), total
+
+    running, sums = jax.lax.scan(add, running, (values, over))
+    return sums, running

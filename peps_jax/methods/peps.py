@@ -1,0 +1,74 @@
+"""PEPS, the paper's method: SAC on r_A + lambda (r_hat + H_T + H_pi), Eq. (6), with T_A and r_hat learned on the way."""
+
+from __future__ import annotations
+
+import jax
+from flax import struct
+from jax import Array
+
+from peps_jax.config import Config
+from peps_jax.methods.method import Method
+from peps_jax.parts import dynamics, queries, surrogate
+from peps_jax.parts.trajectory import Preferences, Segments, Trajectory, Transition
+
+
+@struct.dataclass
+class Knowledge:
+    """What PEPS learns beside the policy."""
+
+    dynamics: dynamics.DynamicsState  # T_A
+    surrogate: surrogate.SurrogateState  # r_hat
+
+
+def init(key: Array, config: Config) -> Knowledge:
+    key_dynamics, key_surrogate = jax.random.split(key)
+    return Knowledge(dynamics=dynamics.init(key_dynamics, config), surrogate=surrogate.init(key_surrogate, config))
+
+
+def ask(knowledge: Knowledge, trajectory: Trajectory, key: Array, config: Config) -> Segments:
+    """The queries of this round: of the latest trajectories' pairs, those from which the ensemble learns most."""
+    key_candidates, key_choose = jax.random.split(key)
+    pairs = queries.candidates(trajectory, key_candidates, config)
+    logits = surrogate.preference_logits(knowledge.surrogate, pairs, config)
+    chosen = queries.choose(logits, queries.describe(pairs), key_choose, config)
+    return jax.tree.map(lambda rows: rows[chosen], pairs)
+
+
+def learn(
+    knowledge: Knowledge,
+    buffer: Transition,
+    filled: Array,
+    preferences: Preferences,
+    index: Array,
+    key: Array,
+    config: Config,
+) -> tuple[Knowledge, dict[str, Array]]:
+    """Lines 4-8 of Algorithm 1: T_A from replay, r_hat from the preferences given so far."""
+    key_dynamics, key_add, key_surrogate = jax.random.split(key, 3)
+    dynamics_state, dynamics_info = dynamics.fit(knowledge.dynamics, buffer, filled, key_dynamics, config)
+    position = index * config.queries_per_round
+    taught = surrogate.add(knowledge.surrogate, preferences, position, key_add, config)
+    known = position + config.queries_per_round
+    surrogate_state, surrogate_info = surrogate.fit(taught, buffer, known, filled, key_surrogate, config)
+    return Knowledge(dynamics=dynamics_state, surrogate=surrogate_state), dynamics_info | surrogate_info
+
+
+def reward(knowledge: Knowledge, transitions: Transition, config: Config) -> Array:
+    """Eq. (6) without its policy entropy, which is SAC's own: r_A + lambda (r_hat + H_T)."""
+    observation, action = transitions.observation, transitions.action
+    preferred = surrogate.predict(knowledge.surrogate, observation, action, config)
+    entropy = dynamics.environment_entropy(knowledge.dynamics, observation, action, config)
+    explicable = config.surrogate_weight * preferred + config.environment_entropy_weight * entropy
+    return transitions.reward + config.lam * explicable
+
+
+PEPS = Method(
+    name="peps",
+    uses_lam=True,
+    init=init,
+    ask=ask,
+    learn=learn,
+    reward=reward,
+    # SAC's own temperature explores; Eq. (6)'s comes on top, so that at lambda = 0 PEPS is SAC
+    temperature=lambda config: config.temperature + config.lam * config.policy_entropy_weight,
+)

@@ -1,0 +1,15 @@
+"""SAC on the environment's reward alone (Haarnoja et al. 2018a, b): learns nothing beside, changes nothing."""
+
+from __future__ import annotations
+
+from peps_jax.methods.method import Method
+
+SAC = Method(
+    name="sac",
+    uses_lam=False,
+    init=lambda key, config: (),
+    ask=lambda knowledge, trajectory, key, config: None,
+    learn=lambda knowledge, buffer, filled, preferences, index, key, config: (knowledge, {}),
+    reward=lambda knowledge, transitions, config: transitions.reward,
+    temperature=lambda config: config.temperature,
+)

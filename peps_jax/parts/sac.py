@@ -1,0 +1,246 @@
+"""Soft actor-critic (Haarnoja et al. 2018a, b), in reward units times `reward_scale`.
+
+    J(Q)  = E[(Q(s,a) - (r + gamma (1 - terminated) V(s')))^2],    V(s) = E_pi[min_j Q_j(s,a) - alpha l_pi(a|s)]
+    J(pi) = E[alpha l_pi(a|s) - min_j Q_j(s,a)]
+
+l_pi = log pi - log uniform: relative to the uniform policy, so that the entropy is at most 0 and never pays for staying alive.
+What the policy's head is made of (a squashed Gaussian, or probabilities of discrete actions) is a `Head`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import distrax
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax import Array
+
+import peps_envs
+from peps_jax.config import Config
+from peps_jax.parts.networks import MLP, apply_ensemble, init_ensemble
+from peps_jax.parts.trajectory import Transition
+
+MIN_LOG_SD, MAX_LOG_SD = -5.0, 2.0
+NUM_CRITICS = 2
+
+
+@struct.dataclass
+class Agent:
+    """Everything that SAC learns."""
+
+    policy: Any
+    critics: Any  # leading axis: critics
+    targets: Any  # the critics' slow copies
+    log_temperature: Array  # () of the tuned temperature, in scaled units
+    policy_optimizer: Any
+    critic_optimizer: Any
+    temperature_optimizer: Any
+
+
+class Head(NamedTuple):
+    """How actions are drawn and valued. `outputs` are the policy network's, `critics` a function of (observation, action)."""
+
+    policy_size: int
+    critic_inputs: int
+    critic_size: int
+    sample: Callable[[Array, Array], tuple[Array, Array]]  # (outputs, key) -> action, l_pi
+    mode: Callable[[Array], Array]  # outputs -> action
+    log_ratio: Callable[[Array, Array], Array]  # (outputs, action) -> l_pi
+    uniform: Callable[[Array], Array]  # key -> action
+    critics: Callable[[Any, Any, Array, Array], Array]  # (network, params, observation, action) -> (critics, ...)
+    # (outputs, key, critics of an action at this observation) -> E_pi[min Q], E_pi[l_pi]
+    expect: Callable[[Array, Array, Any, Any, Array], tuple[Array, Array]]
+
+
+def squashed_gaussian(outputs: Array) -> distrax.Distribution:
+    """tanh of a Gaussian: actions in (-1, 1)^n from outputs (..., 2n)."""
+    mean, log_sd = jnp.split(outputs, 2, axis=-1)
+    log_sd = MIN_LOG_SD + 0.5 * (MAX_LOG_SD - MIN_LOG_SD) * (jnp.tanh(log_sd) + 1)
+    return distrax.Transformed(distrax.MultivariateNormalDiag(mean, jnp.exp(log_sd)), distrax.Block(distrax.Tanh(), 1))
+
+
+def continuous_head(observation_size: int, action_size: int) -> Head:
+    """A tanh-squashed Gaussian; expectations are taken with one sample, through which gradients flow."""
+    log_volume = action_size * math.log(2.0)  # of [-1, 1]^n
+
+    def sample(outputs: Array, key: Array) -> tuple[Array, Array]:
+        action, log_prob = squashed_gaussian(outputs).sample_and_log_prob(seed=key)
+        return action, log_prob + log_volume
+
+    def log_ratio(outputs: Array, action: Array) -> Array:
+        # the inverse of tanh is infinite at 1
+        limit = 1 - 1e-6
+        return squashed_gaussian(outputs).log_prob(jnp.clip(action, -limit, limit)) + log_volume
+
+    def critics(network: MLP, params: Any, observation: Array, action: Array) -> Array:
+        return apply_ensemble(network)(params, jnp.concatenate([observation, action], -1))[..., 0]
+
+    def expect(outputs: Array, key: Array, network: MLP, params: Any, observation: Array) -> tuple[Array, Array]:
+        action, ratio = sample(outputs, key)
+        return jnp.min(critics(network, params, observation, action), 0), ratio
+
+    return Head(
+        policy_size=2 * action_size,
+        critic_inputs=observation_size + action_size,
+        critic_size=1,
+        sample=sample,
+        mode=lambda outputs: jnp.tanh(jnp.split(outputs, 2, axis=-1)[0]),
+        log_ratio=log_ratio,
+        uniform=lambda key: jax.random.uniform(key, (action_size,), minval=-1.0, maxval=1.0),
+        critics=critics,
+        expect=expect,
+    )
+
+
+def discrete_head(observation_size: int, num_actions: int) -> Head:
+    """Probabilities of discrete actions; critics value all of them at once, so expectations are exact sums."""
+    log_actions = math.log(num_actions)
+
+    def log_ratio(outputs: Array, action: Array) -> Array:
+        return jnp.take_along_axis(jax.nn.log_softmax(outputs), action[..., None], -1)[..., 0] + log_actions
+
+    def sample(outputs: Array, key: Array) -> tuple[Array, Array]:
+        action = distrax.Categorical(logits=outputs).sample(seed=key)
+        return action, log_ratio(outputs, action)
+
+    def critics(network: MLP, params: Any, observation: Array, action: Array) -> Array:
+        values = apply_ensemble(network)(params, observation)
+        return jnp.take_along_axis(values, jnp.broadcast_to(action, values.shape[:-1])[..., None], -1)[..., 0]
+
+    def expect(outputs: Array, key: Array, network: MLP, params: Any, observation: Array) -> tuple[Array, Array]:
+        del key
+        probabilities, log_probabilities = jax.nn.softmax(outputs), jax.nn.log_softmax(outputs)
+        values = jnp.min(apply_ensemble(network)(params, observation), 0)
+        return jnp.sum(probabilities * values, -1), jnp.sum(probabilities * log_probabilities, -1) + log_actions
+
+    return Head(
+        policy_size=num_actions,
+        critic_inputs=observation_size,
+        critic_size=num_actions,
+        sample=sample,
+        mode=lambda outputs: jnp.argmax(outputs, -1),
+        log_ratio=log_ratio,
+        uniform=lambda key: jax.random.randint(key, (), 0, num_actions),
+        critics=critics,
+        expect=expect,
+    )
+
+
+def head(environment: peps_envs.Environment) -> Head:
+    """The head for the environment's action space."""
+    make = discrete_head if isinstance(environment.action_space, peps_envs.Discrete) else continuous_head
+    return make(environment.observation_size, environment.action_space.size)
+
+
+def networks(config: Config) -> tuple[Head, MLP, MLP]:
+    """The head, the policy's network and a critic's."""
+    environment, _, _ = config.task()
+    parts = head(environment)
+    return parts, MLP(config.hidden_sizes, parts.policy_size, output_scale=0.01), MLP(config.hidden_sizes, parts.critic_size)
+
+
+def init(key: Array, config: Config) -> Agent:
+    """An untrained agent; the targets start as the critics."""
+    environment, _, _ = config.task()
+    key_policy, key_critics = jax.random.split(key)
+    parts, policy_network, critic_network = networks(config)
+    policy = policy_network.init(key_policy, jnp.zeros(environment.observation_size))
+    critics = init_ensemble(critic_network, key_critics, NUM_CRITICS, parts.critic_inputs)
+    log_temperature = jnp.log(jnp.maximum(config.temperature * config.reward_scale, 1e-6))
+    optimizer = optax.adam(config.learning_rate)
+    return Agent(
+        policy=policy,
+        critics=critics,
+        targets=critics,
+        log_temperature=log_temperature,
+        policy_optimizer=optimizer.init(policy),
+        critic_optimizer=optimizer.init(critics),
+        temperature_optimizer=optimizer.init(log_temperature),
+    )
+
+
+def act(agent: Agent, observation: Array, key: Array, config: Config) -> tuple[Array, Array]:
+    """A sampled action and l_pi(a|s), for one observation."""
+    parts, policy_network, _ = networks(config)
+    return parts.sample(policy_network.apply(agent.policy, observation), key)
+
+
+def mode(agent: Agent, observation: Array, config: Config) -> tuple[Array, Array]:
+    """The policy's most likely action before squashing, and l_pi(a|s), for one observation."""
+    parts, policy_network, _ = networks(config)
+    outputs = policy_network.apply(agent.policy, observation)
+    action = parts.mode(outputs)
+    return action, parts.log_ratio(outputs, action)
+
+
+def critic_loss(critics: Any, targets: Array, batch: Transition, config: Config) -> Array:
+    """Half the squared temporal difference, summed over critics and averaged over the batch."""
+    parts, _, critic_network = networks(config)
+    values = parts.critics(critic_network, critics, batch.observation, batch.action)
+    return 0.5 * jnp.sum(jnp.mean((values - targets) ** 2, -1))
+
+
+def critic_targets(agent: Agent, batch: Transition, temperature: Array, key: Array, config: Config) -> Array:
+    """r + gamma (1 - terminated) V(s') by the target critics: bootstraps through a time limit, not through an end."""
+    parts, policy_network, critic_network = networks(config)
+    outputs = policy_network.apply(agent.policy, batch.next_observation)
+    value, ratio = parts.expect(outputs, key, critic_network, agent.targets, batch.next_observation)
+    return batch.reward + config.gamma * (1 - batch.terminated) * (value - temperature * ratio)
+
+
+def policy_loss(
+    policy: Any, critics: Any, batch: Transition, temperature: Array, key: Array, config: Config
+) -> tuple[Array, Array]:
+    """E[alpha l_pi - min Q], and the mean policy entropy relative to the uniform policy."""
+    parts, policy_network, critic_network = networks(config)
+    outputs = policy_network.apply(policy, batch.observation)
+    value, ratio = parts.expect(outputs, key, critic_network, critics, batch.observation)
+    return jnp.mean(temperature * ratio - value), -jnp.mean(ratio)
+
+
+def target_entropy(environment: peps_envs.Environment) -> float:
+    """What a tuned temperature aims at, relative to the uniform policy: -n of Haarnoja et al. (2018b) less log 2^n."""
+    space = environment.action_space
+    if isinstance(space, peps_envs.Discrete):
+        return -0.5 * math.log(space.size)
+    return -space.size * (1 + math.log(2.0))
+
+
+def update(agent: Agent, batch: Transition, temperature: Array, key: Array, config: Config) -> tuple[Agent, dict[str, Array]]:
+    """One step on critics, policy, targets and, if it is tuned, temperature; `batch.reward` in scaled units."""
+    key_target, key_policy = jax.random.split(key)
+    optimizer = optax.adam(config.learning_rate)
+    alpha = jnp.exp(agent.log_temperature) if config.tune_temperature else temperature
+
+    targets = critic_targets(agent, batch, alpha, key_target, config)
+    critic_error, critic_grads = jax.value_and_grad(critic_loss)(agent.critics, targets, batch, config)
+    critic_steps, critic_optimizer = optimizer.update(critic_grads, agent.critic_optimizer)
+    critics = optax.apply_updates(agent.critics, critic_steps)
+
+    (_, entropy), policy_grads = jax.value_and_grad(policy_loss, has_aux=True)(
+        agent.policy, critics, batch, alpha, key_policy, config
+    )
+    policy_steps, policy_optimizer = optimizer.update(policy_grads, agent.policy_optimizer)
+    agent = agent.replace(
+        policy=optax.apply_updates(agent.policy, policy_steps),
+        critics=critics,
+        targets=optax.incremental_update(critics, agent.targets, config.target_rate),
+        policy_optimizer=policy_optimizer,
+        critic_optimizer=critic_optimizer,
+    )
+    if config.tune_temperature:
+        agent = _tune(agent, entropy, config)
+    return agent, {"critic_loss": critic_error, "policy_entropy": entropy, "temperature": alpha}
+
+
+def _tune(agent: Agent, entropy: Array, config: Config) -> Agent:
+    """Moves the temperature up where the entropy is below its target (Haarnoja et al. 2018b, Eq. 18)."""
+    environment, _, _ = config.task()
+    gradient = entropy - target_entropy(environment)
+    step, optimizer = optax.adam(config.learning_rate).update(gradient, agent.temperature_optimizer)
+    return agent.replace(log_temperature=agent.log_temperature + step, temperature_optimizer=optimizer)

@@ -1,0 +1,164 @@
+"""A training: the paper's Algorithm 1 as one pure function of a `Config`.
+
+`train` scans over rounds. A round has two halves with the teacher between them: `collect_and_ask` ends with queries,
+`learn_and_improve` begins with preferences. A host loop may run rounds one by one (`run_round`), or the halves with a person
+in between, and gets the same numbers as the scan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from peps_jax import methods, rollout
+from peps_jax.config import Config
+from peps_jax.parts import human, replay, sac
+from peps_jax.parts.trajectory import Preferences, Segments, Transition
+
+
+@struct.dataclass
+class TrainingState:
+    """All of a training between two rounds, random key included."""
+
+    agent: sac.Agent
+    knowledge: Any  # what the method learns beside the policy
+    replay: Transition
+    actors: rollout.Actors
+    key: Array
+
+
+@struct.dataclass
+class Result:
+    """A finished training, ready to act."""
+
+    agent: sac.Agent
+    knowledge: Any
+    curves: dict[str, Array]  # (rounds,) each
+    config: Config
+
+    def act(self, observation: Array, key: Array | None = None) -> Array:
+        """The action for one observation: the policy's mode, or a sample if a key is given."""
+        return self.policy()(observation, key)[0]
+
+    def policy(self) -> Callable[[Array, Array | None], tuple[Array, Array]]:
+        """(observation, key or None) -> the action and l_pi, log pi(a|s) relative to the uniform policy."""
+
+        def policy(observation: Array, key: Array | None) -> tuple[Array, Array]:
+            if key is None:
+                return sac.mode(self.agent, observation, self.config)
+            return sac.act(self.agent, observation, key, self.config)
+
+        return policy
+
+
+def check(config: Config) -> None:
+    """Raises ValueError, in one line, for the first setting that makes no sense."""
+    methods.get(config.method)
+    config.check()
+
+
+def init(config: Config) -> TrainingState:
+    """The state before the first round."""
+    key_agent, key_knowledge, key_actors, key = jax.random.split(jax.random.key(config.seed), 4)
+    environment, _, _ = config.task()
+    return TrainingState(
+        agent=sac.init(key_agent, config),
+        knowledge=methods.get(config.method).init(key_knowledge, config),
+        replay=replay.init(config.num_rounds * config.steps_per_round, environment),
+        actors=rollout.init(key_actors, config),
+        key=key,
+    )
+
+
+def collect_and_ask(
+    state: TrainingState, index: Array, config: Config
+) -> tuple[TrainingState, Segments | None, dict[str, Array]]:
+    """The first half of round `index`: act, remember, and choose what to ask. Queries are None from a method that asks nothing."""
+    key_act, key_ask, _, _, _ = _round_keys(state, index)
+    parts, policy_network, _ = sac.networks(config)
+
+    def act(observation: Array, key: Array) -> Array:
+        action, _ = parts.sample(policy_network.apply(state.agent.policy, observation), key)
+        uniform = jax.vmap(parts.uniform)(jax.random.split(key, config.num_envs))
+        return jnp.where(index < config.warmup_rounds, uniform, action)
+
+    actors, trajectory, info = rollout.collect(state.actors, act, key_act, config)
+    flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), trajectory.transition)
+    buffer = replay.add(state.replay, flat, index * config.steps_per_round)
+    queries = methods.get(config.method).ask(state.knowledge, trajectory, key_ask, config)
+    return state.replace(actors=actors, replay=buffer), queries, info
+
+
+def learn_and_improve(
+    state: TrainingState, index: Array, preferences: Preferences | None, config: Config
+) -> tuple[TrainingState, dict[str, Array]]:
+    """The second half of round `index`: learn from replay and preferences, then improve the policy."""
+    _, _, _, key_learn, key_improve = _round_keys(state, index)
+    filled = (index + 1) * config.steps_per_round
+    knowledge, learned = methods.get(config.method).learn(
+        state.knowledge, state.replay, filled, preferences, index, key_learn, config
+    )
+    state = state.replace(knowledge=knowledge)
+    agent, improved = improve(state, filled, key_improve, config)
+    return state.replace(agent=agent), learned | improved
+
+
+def improve(state: TrainingState, filled: Array, key: Array, config: Config) -> tuple[sac.Agent, dict[str, Array]]:
+    """SAC updates of one round, on minibatches whose reward is the method's, by what it knows now."""
+    method = methods.get(config.method)
+    key_batch, key_update = jax.random.split(key)
+    batches = replay.sample(state.replay, key_batch, (config.updates_per_round, config.batch_size), filled)
+    # all at once: what the method knows doesn't change within a round
+    batches = batches._replace(reward=method.reward(state.knowledge, batches, config) * config.reward_scale)
+    temperature = method.temperature(config) * config.reward_scale
+
+    def update(agent: sac.Agent, step: tuple[Transition, Array]) -> tuple[sac.Agent, dict[str, Array]]:
+        batch, key = step
+        return sac.update(agent, batch, temperature, key, config)
+
+    agent, info = jax.lax.scan(update, state.agent, (batches, jax.random.split(key_update, config.updates_per_round)))
+    return agent, jax.tree.map(jnp.mean, info)
+
+
+def run_round(
+    state: TrainingState, index: Array, config: Config, teacher: human.Teacher = human.SYNTHETIC
+) -> tuple[TrainingState, dict[str, Array]]:
+    """Round `index` with a teacher that answers inside the program; returns the state and the round's figures."""
+    state, queries, collected = collect_and_ask(state, index, config)
+    _, _, key_teacher, _, _ = _round_keys(state, index)
+    preferences = None if queries is None else teacher.answer(key_teacher, queries, config)
+    state, learned = learn_and_improve(state, index, preferences, config)
+    return state, collected | learned
+
+
+def run_rounds(
+    state: TrainingState, indices: Array, config: Config, teacher: human.Teacher = human.SYNTHETIC
+) -> tuple[TrainingState, dict[str, Array]]:
+    """Rounds `indices` (n,) one after the other: the state after them, and curves (n,)."""
+    return jax.lax.scan(lambda state, index: run_round(state, index, config, teacher), state, indices)
+
+
+def train(config: Config, teacher: human.Teacher = human.SYNTHETIC) -> Result:
+    """A whole training. Pure: works under `jax.jit`, `jax.vmap` (over any traced leaves of `config`) and in a scan.
+
+    Raises:
+      ValueError: a setting makes no sense; one line says which, its value, and what would be right.
+    """
+    check(config)
+    state, curves = run_rounds(init(config), jnp.arange(config.num_rounds), config, teacher)
+    return finish(state, curves, config)
+
+
+def finish(state: TrainingState, curves: dict[str, Array], config: Config) -> Result:
+    """What remains of a training when its rounds are done."""
+    return Result(agent=state.agent, knowledge=state.knowledge, curves=curves, config=config)
+
+
+def _round_keys(state: TrainingState, index: Array) -> Array:
+    """Keys of round `index`: acting, asking, answering, learning, improving. The same from every half."""
+    return jax.random.split(jax.random.fold_in(state.key, index), 5)
