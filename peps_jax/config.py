@@ -48,7 +48,7 @@ class Config:
     surrogate_weight: Any = _traced(1.0, "weight of the surrogate reward in Eq. (6)", group="objective")
     environment_entropy_weight: Any = _traced(1.0, "weight of the environment entropy in Eq. (6)", group="objective")
     policy_entropy_weight: Any = _traced(1.0, "weight of the policy entropy in Eq. (6)", group="objective")
-    gamma: Any = _traced(0.99, "discount", group="objective")
+    gamma: Any = _traced(0.995, "discount", group="objective")
 
     total_steps: int = _static(30_000, "environment steps in all", group="run")
     num_envs: int = _static(16, "environments side by side", group="run")
