@@ -53,12 +53,16 @@ class Config:
     total_steps: int = _static(30_000, "environment steps in all", group="run")
     num_envs: int = _static(16, "environments side by side", group="run")
     rollout_length: int = _static(25, "steps that each environment makes in a round", group="run")
-    warmup_steps: int = _static(1_200, "environment steps with uniformly random actions at the start", group="run")
+    warmup_steps: int = _static(3_200, "environment steps with uniformly random actions at the start", group="run")
+    warmup_hold: int = _static(5, "steps for which each of those actions is held", group="run")
 
     learning_rate: Any = _traced(1e-3, "Adam's rate for policy and critics", group="sac")
-    temperature: Any = _traced(0.5, "weight of the policy entropy beside Eq. (6)'s (in reward units)", group="sac")
+    temperature: Any = _traced(0.1, "weight of the policy entropy beside Eq. (6)'s, at the end (in reward units)", group="sac")
+    initial_temperature: Any = _traced(2.0, "the same at the start: exploration fades", group="sac")
+    anneal_share: Any = _traced(0.7, "share of the rounds over which the temperature fades", group="sac")
+    saturation_penalty: Any = _traced(0.05, "price of a squared action before tanh (in reward units)", group="sac")
     tune_temperature: bool = _static(False, "tune the temperature to a target entropy instead", group="sac")
-    target_rate: Any = _traced(0.005, "share of the critics that the targets take over at an update", group="sac")
+    target_rate: Any = _traced(0.01, "share of the critics that the targets take over at an update", group="sac")
     reward_scale: Any = _traced(0.1, "what rewards are multiplied by before the critics see them", group="sac")
     updates_per_step: float = _static(0.25, "SAC updates per environment step", group="sac")
     batch_size: int = _static(256, "transitions in a minibatch", group="sac")
@@ -141,7 +145,7 @@ class Config:
         for name in (
             "total_steps", "num_envs", "rollout_length", "batch_size", "ensemble_size", "dynamics_updates",
             "surrogate_updates", "surrogate_batch_size", "num_queries", "segment_length", "min_segment_length",
-            "candidates_per_query",
+            "candidates_per_query", "warmup_hold",
         ):  # fmt: skip
             _require(name, getattr(self, name), lambda value: isinstance(value, int) and value >= 1, "a whole number from 1 on")
         _require("warmup_steps", self.warmup_steps, lambda value: value >= 0, "0 or more")
@@ -159,11 +163,11 @@ class Config:
         if self.candidates_per_query < 10:
             raise ValueError(f"candidates_per_query {self.candidates_per_query}: choose 10 or more, or the choice is no choice")
         for name in (
-            "lam", "temperature", "rationality", "indifference", "surrogate_decay", "surrogate_weight",
+            "lam", "temperature", "saturation_penalty", "initial_temperature", "rationality", "indifference", "surrogate_decay", "surrogate_weight",
             "environment_entropy_weight", "policy_entropy_weight",
         ):  # fmt: skip
             _require(name, getattr(self, name), lambda value: value >= 0, "0 or more")
-        for name in ("gamma", "myopia", "mistake_rate", "target_rate"):
+        for name in ("gamma", "myopia", "mistake_rate", "target_rate", "anneal_share"):
             _require(name, getattr(self, name), lambda value: (value >= 0) & (value <= 1), "from 0 to 1")
         for name in ("learning_rate", "dynamics_learning_rate", "surrogate_learning_rate", "reward_scale"):
             _require(name, getattr(self, name), lambda value: value > 0, "above 0")

@@ -105,9 +105,10 @@ def solve(
         return reward, index.reshape(-1), (gamma * (weights * ~ended)[:, None] * share).reshape(-1)
 
     ticks = np.linspace(0, 1, resolution)
-    nodes = jnp.asarray(np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2), jnp.float32) * params.size
+    nodes = jnp.asarray(np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2), jnp.float32) * params.size[None]
     every_action = jax.vmap(consequences, in_axes=(None, 0))
-    rewards, index, weights = jax.lax.map(lambda node: every_action(node, actions), nodes, batch_size=512)
+    # row by row: no remainder, which would be a program of its own
+    rewards, index, weights = jax.lax.map(lambda node: every_action(node, actions), nodes, batch_size=resolution)
 
     def sweep(carry: tuple[Array, Array]) -> tuple[Array, Array]:
         values, _ = carry

@@ -41,12 +41,12 @@ def init(key: Array, config: Config) -> Actors:
 
 
 def collect(
-    actors: Actors, act: Callable[[Array, Array], Array], key: Array, config: Config
+    actors: Actors, act: Callable[[Array, Array, Array], Array], key: Array, config: Config
 ) -> tuple[Actors, Trajectory, dict[str, Array]]:
     """`rollout_length` steps of every environment; an episode that ends is followed by a new one.
 
     Args:
-      act: (observations (num_envs, ...), key) -> actions (num_envs, ...).
+      act: (observations (num_envs, ...), key, step within the round) -> actions (num_envs, ...).
 
     Returns:
       actors: where the environments stand now.
@@ -57,10 +57,11 @@ def collect(
     reset = jax.vmap(environment.reset, in_axes=(0, None))
     step = jax.vmap(environment.step, in_axes=(0, 0, 0, None))
 
-    def step_all(carry: tuple[Any, Array], key: Array) -> tuple[tuple[Any, Array], Trajectory]:
+    def step_all(carry: tuple[Any, Array], now: tuple[Array, Array]) -> tuple[tuple[Any, Array], Trajectory]:
         state, observation = carry
+        time, key = now
         key_act, key_env, key_reset = jax.random.split(key, 3)
-        action = act(observation, key_act)
+        action = act(observation, key_act, time)
         after = step(jax.random.split(key_env, config.num_envs), state, action, params)
         over = after.terminated | after.truncated
         start, first = reset(jax.random.split(key_reset, config.num_envs), params)
@@ -72,7 +73,8 @@ def collect(
         return (jax.tree.map(restart, start, after.state), restart(first, after.observation)), row
 
     keys = jax.random.split(key, config.rollout_length)
-    (state, observation), trajectory = jax.lax.scan(step_all, (actors.state, actors.observation), keys)
+    times = jnp.arange(config.rollout_length)
+    (state, observation), trajectory = jax.lax.scan(step_all, (actors.state, actors.observation), (times, keys))
 
     score = jax.vmap(jax.vmap(lambda *transition: explicability.score(environment, params, belief, *transition)))
     scores = score(trajectory.state, trajectory.transition.action, trajectory.next_state)

@@ -80,11 +80,14 @@ def collect_and_ask(
 ) -> tuple[TrainingState, Segments | None, dict[str, Array]]:
     """The first half of round `index`: act, remember, and choose what to ask. Queries are None from a method that asks nothing."""
     key_act, key_ask, _, _, _ = _round_keys(state, index)
+    key_act, key_warmup = jax.random.split(key_act)
     parts, policy_network, _ = sac.networks(config)
 
-    def act(observation: Array, key: Array) -> Array:
+    def act(observation: Array, key: Array, time: Array) -> Array:
         action, _ = parts.sample(policy_network.apply(state.agent.policy, observation), key)
-        uniform = jax.vmap(parts.uniform)(jax.random.split(key, config.num_envs))
+        # a random action is held: a walk that turns at every step hardly leaves the start
+        key_held = jax.random.fold_in(key_warmup, time // config.warmup_hold)
+        uniform = jax.vmap(parts.uniform)(jax.random.split(key_held, config.num_envs))
         return jnp.where(index < config.warmup_rounds, uniform, action)
 
     actors, trajectory, info = rollout.collect(state.actors, act, key_act, config)
@@ -104,18 +107,19 @@ def learn_and_improve(
         state.knowledge, state.replay, filled, preferences, index, key_learn, config
     )
     state = state.replace(knowledge=knowledge)
-    agent, improved = improve(state, filled, key_improve, config)
+    agent, improved = improve(state, index, key_improve, config)
     return state.replace(agent=agent), learned | improved
 
 
-def improve(state: TrainingState, filled: Array, key: Array, config: Config) -> tuple[sac.Agent, dict[str, Array]]:
+def improve(state: TrainingState, index: Array, key: Array, config: Config) -> tuple[sac.Agent, dict[str, Array]]:
     """SAC updates of one round, on minibatches whose reward is the method's, by what it knows now."""
     method = methods.get(config.method)
     key_batch, key_update = jax.random.split(key)
+    filled = (index + 1) * config.steps_per_round
     batches = replay.sample(state.replay, key_batch, (config.updates_per_round, config.batch_size), filled)
     # all at once: what the method knows doesn't change within a round
     batches = batches._replace(reward=method.reward(state.knowledge, batches, config) * config.reward_scale)
-    temperature = method.temperature(config) * config.reward_scale
+    temperature = (annealed_temperature(index, config) + method.entropy_weight(config)) * config.reward_scale
 
     def update(agent: sac.Agent, step: tuple[Transition, Array]) -> tuple[sac.Agent, dict[str, Array]]:
         batch, key = step
@@ -123,6 +127,13 @@ def improve(state: TrainingState, filled: Array, key: Array, config: Config) -> 
 
     agent, info = jax.lax.scan(update, state.agent, (batches, jax.random.split(key_update, config.updates_per_round)))
     return agent, jax.tree.map(jnp.mean, info)
+
+
+def annealed_temperature(index: Array, config: Config) -> Array:
+    """SAC's own temperature in round `index`, in reward units: from `initial_temperature` to `temperature`, geometrically."""
+    done = jnp.clip(index / jnp.maximum(config.anneal_share * config.num_rounds, 1.0), 0.0, 1.0)
+    first, last = jnp.maximum(config.initial_temperature, 1e-6), jnp.maximum(config.temperature, 1e-6)
+    return jnp.exp((1 - done) * jnp.log(first) + done * jnp.log(last))
 
 
 def run_round(

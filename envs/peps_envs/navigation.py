@@ -6,7 +6,9 @@ A point moves in a walled arena, x to the right and y downwards, towards a goal 
 
 and, on sand, not at all with probability `sand_stuck`: a step, then a slip. Walls stop a movement and let it slide along:
 x moves first, as far as the free interval of its row allows, then y in the new column. Gain and noise depend on the ground
-where the step begins, and the noise also on the distance to the pit:  noise^2 = pit_noise^2 exp(-(distance / pit_range)^2) + ice_noise^2 [on ice].
+where the step begins, and the noise also on the distance to the pit:
+
+    noise^2 = pit_noise^2 exp(-(distance / pit_range)^2) + ice_noise^2 [on ice].
 
 All of this is data (`NavigationParams`): the true domain and the human's belief are two values of it.
 """
@@ -169,7 +171,7 @@ class NavigationNextState(NextState):
     def relative_entropy(self) -> Array:
         weights, positions = self.quadrature(7)
         mean = weights @ positions
-        variance = weights @ (positions - mean) ** 2
+        variance = weights @ (positions - mean[None]) ** 2
         return 0.5 * jnp.sum(jnp.log1p(variance / self.params.perception_width**2))
 
     def sample(self, key: Array) -> Array:
@@ -196,10 +198,14 @@ class Navigation(Environment):
     """Move a point to the goal area; see the module's text. Events: `goal_reached`, `pit_reached`."""
 
     horizon: int = 200
+    waves: int = 2  # wavelengths of the observed sines and cosines: the arena's width twice, once, a half, ...
 
-    observation_size = 2
     action_space = Box(2)
     event_names = ("goal_reached", "pit_reached")
+
+    @property
+    def observation_size(self) -> int:
+        return 2 + 4 * self.waves
 
     def reset(self, key: Array, params: NavigationParams) -> tuple[NavigationState, Array]:
         del key  # one start state
@@ -248,14 +254,20 @@ class Navigation(Environment):
         )
 
     def observe(self, state: NavigationState, params: NavigationParams) -> Array:
-        """The position, scaled to [-1, 1]."""
-        return 2 * state.position / params.size - 1
+        """The position, scaled to [-1, 1], with sines and cosines of it.
+
+        The pit's edge is sharp against the arena, and a step is worth little against the pit: without the waves, small
+        networks blur the values so much that walking on and standing still look alike.
+        """
+        scaled = 2 * state.position / params.size - 1
+        phases = [0.5 * jnp.pi * 2.0**wave * scaled for wave in range(self.waves)]
+        return jnp.concatenate([scaled, *(wave(phase) for phase in phases for wave in (jnp.sin, jnp.cos))])
 
     def perceive(self, state: NavigationState) -> Array:
         return state.position
 
     def perceive_observation(self, observation: Array, params: NavigationParams) -> Array:
-        return (observation + 1) / 2 * params.size
+        return (observation[..., :2] + 1) / 2 * params.size
 
     def perception_width(self, params: NavigationParams) -> Array:
         return jnp.broadcast_to(params.perception_width, (2,))

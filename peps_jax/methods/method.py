@@ -26,4 +26,4 @@ class Method(NamedTuple):
     learn: Callable[[Any, Transition, Array, Preferences | None, Array, Array, Config], tuple[Any, dict[str, Array]]]
     # (knowledge, transitions, config) -> rewards, in reward units
     reward: Callable[[Any, Transition, Config], Array]
-    temperature: Callable[[Config], Array]  # weight of SAC's policy entropy, in reward units
+    entropy_weight: Callable[[Config], Array]  # of the policy entropy beside SAC's own temperature, in reward units

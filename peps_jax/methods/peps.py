@@ -70,5 +70,5 @@ PEPS = Method(
     learn=learn,
     reward=reward,
     # SAC's own temperature explores; Eq. (6)'s comes on top, so that at lambda = 0 PEPS is SAC
-    temperature=lambda config: config.temperature + config.lam * config.policy_entropy_weight,
+    entropy_weight=lambda config: config.lam * config.policy_entropy_weight,
 )

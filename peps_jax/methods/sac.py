@@ -11,5 +11,5 @@ SAC = Method(
     ask=lambda knowledge, trajectory, key, config: None,
     learn=lambda knowledge, buffer, filled, preferences, index, key, config: (knowledge, {}),
     reward=lambda knowledge, transitions, config: transitions.reward,
-    temperature=lambda config: config.temperature,
+    entropy_weight=lambda config: 0.0,
 )

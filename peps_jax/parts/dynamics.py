@@ -69,10 +69,10 @@ def _prediction(outputs: Array) -> Prediction:
     return Prediction(mean=mean, log_sd=MIN_LOG_SD + jax.nn.softplus(log_sd - MIN_LOG_SD))
 
 
-def movement(transitions: Transition, environment: peps_envs.Environment, params: Any) -> Array:
-    """What `predict` predicts: how the perceived state moved, in units of sigma_p, (..., perceived_size)."""
-    before = environment.perceive_observation(transitions.observation, params)
-    after = environment.perceive_observation(transitions.next_observation, params)
+def movement(transition: Transition, environment: peps_envs.Environment, params: Any) -> Array:
+    """What `predict` predicts: how the perceived state moved, in units of sigma_p, (perceived_size,)."""
+    before = environment.perceive_observation(transition.observation, params)
+    after = environment.perceive_observation(transition.next_observation, params)
     return (after - before) / environment.perception_width(params)
 
 
@@ -81,7 +81,8 @@ def loss(params: Any, transitions: Transition, config: Config) -> Array:
     environment, world, _ = config.task()
     prediction = predict(params, transitions.observation, transitions.action, config)
     density = distrax.MultivariateNormalDiag(prediction.mean, jnp.exp(prediction.log_sd))
-    return -jnp.mean(density.log_prob(movement(transitions, environment, world)))
+    moved = jax.vmap(movement, in_axes=(0, None, None))(transitions, environment, world)
+    return -jnp.mean(density.log_prob(moved))
 
 
 def fit(

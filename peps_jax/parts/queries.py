@@ -30,7 +30,7 @@ def candidates(trajectory: Trajectory, key: Array, config: Config) -> Segments:
     env = jax.random.randint(key_env, shape, 0, num_envs)[..., None]
     start = jax.random.randint(key_start, shape, 0, steps - config.segment_length + 1)[..., None]
     length = jax.random.randint(key_length, shape, config.min_segment_length, config.segment_length + 1)[..., None]
-    offset = jnp.arange(config.segment_length)
+    offset = jnp.arange(config.segment_length)[None, None]
     cut = jax.tree.map(lambda rows: rows[start + offset, env], trajectory)
     over = jnp.maximum(cut.transition.terminated, cut.truncated.astype(jnp.float32))
     ended_before = jnp.cumsum(over, -1) - over > 0
@@ -75,7 +75,7 @@ def choose(logits: Array, descriptions: Array, key: Array, config: Config) -> Ar
 
     def take(score: Array, _: None) -> tuple[Array, Array]:
         best = jnp.argmax(score)
-        squared = jnp.sum((descriptions - descriptions[best]) ** 2, -1)
+        squared = jnp.sum((descriptions - descriptions[best][None]) ** 2, -1)
         # a tenth of the typical distance counts as near; the chosen one itself gets 0 and is never taken twice
         return score * -jnp.expm1(-100 * squared / typical), best
 

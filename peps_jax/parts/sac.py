@@ -53,6 +53,7 @@ class Head(NamedTuple):
     log_ratio: Callable[[Array, Array], Array]  # (outputs, action) -> l_pi
     uniform: Callable[[Array], Array]  # key -> action
     critics: Callable[[Any, Any, Array, Array], Array]  # (network, params, observation, action) -> (critics, ...)
+    penalty: Callable[[Array], Array]  # outputs -> what keeps the policy where gradients reach it, at least 0
     # (outputs, key, critics of an action at this observation) -> E_pi[min Q], E_pi[l_pi]
     expect: Callable[[Array, Array, Any, Any, Array], tuple[Array, Array]]
 
@@ -93,6 +94,8 @@ def continuous_head(observation_size: int, action_size: int) -> Head:
         log_ratio=log_ratio,
         uniform=lambda key: jax.random.uniform(key, (action_size,), minval=-1.0, maxval=1.0),
         critics=critics,
+        # where tanh is flat no gradient turns an action back: a policy that leans against a wall would stay there
+        penalty=lambda outputs: jnp.mean(jnp.sum(jnp.split(outputs, 2, axis=-1)[0] ** 2, -1)),
         expect=expect,
     )
 
@@ -127,6 +130,7 @@ def discrete_head(observation_size: int, num_actions: int) -> Head:
         log_ratio=log_ratio,
         uniform=lambda key: jax.random.randint(key, (), 0, num_actions),
         critics=critics,
+        penalty=lambda outputs: jnp.zeros(()),
         expect=expect,
     )
 
@@ -182,7 +186,7 @@ def critic_loss(critics: Any, targets: Array, batch: Transition, config: Config)
     """Half the squared temporal difference, summed over critics and averaged over the batch."""
     parts, _, critic_network = networks(config)
     values = parts.critics(critic_network, critics, batch.observation, batch.action)
-    return 0.5 * jnp.sum(jnp.mean((values - targets) ** 2, -1))
+    return 0.5 * jnp.sum(jnp.mean((values - targets[None]) ** 2, -1))
 
 
 def critic_targets(agent: Agent, batch: Transition, temperature: Array, key: Array, config: Config) -> Array:
@@ -200,7 +204,8 @@ def policy_loss(
     parts, policy_network, critic_network = networks(config)
     outputs = policy_network.apply(policy, batch.observation)
     value, ratio = parts.expect(outputs, key, critic_network, critics, batch.observation)
-    return jnp.mean(temperature * ratio - value), -jnp.mean(ratio)
+    penalty = config.saturation_penalty * config.reward_scale * parts.penalty(outputs)
+    return jnp.mean(temperature * ratio - value) + penalty, -jnp.mean(ratio)
 
 
 def target_entropy(environment: peps_envs.Environment) -> float:

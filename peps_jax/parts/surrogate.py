@@ -82,7 +82,7 @@ def add(state: SurrogateState, preferences: Preferences, position: Array, key: A
 def segment_sums(params: Any, features: Array, mask: Array, config: Config) -> Array:
     """sum_t r_hat over segments, by every member: (members, ...) from features (..., steps, n) and mask (..., steps)."""
     rewards = apply_ensemble(_network(config))(params, features)[..., 0]
-    return jnp.sum(rewards * mask, -1)
+    return jnp.sum(rewards * mask[None], -1)
 
 
 def preference_logits(state: SurrogateState, segments: Segments, config: Config) -> Array:
@@ -100,10 +100,10 @@ def loss(params: Any, features: Array, mask: Array, answers: Array, weights: Arr
     """
     sums = segment_sums(params, features, mask, config)
     logits = sums[..., 0] - sums[..., 1]  # (members, n); logits, because exp overflows on long segments
-    cross_entropy = optax.sigmoid_binary_cross_entropy(logits, answers)
+    cross_entropy = optax.sigmoid_binary_cross_entropy(logits, answers[None])
     total = jnp.maximum(jnp.sum(weights), 1.0)
-    decided = weights.T * (answers != 0.5)
-    correct = jnp.sum(decided * ((logits > 0) == (answers > 0.5))) / jnp.maximum(jnp.sum(decided), 1.0)
+    decided = weights.T * (answers != 0.5)[None]
+    correct = jnp.sum(decided * ((logits > 0) == (answers > 0.5)[None])) / jnp.maximum(jnp.sum(decided), 1.0)
     return jnp.sum(weights.T * cross_entropy) / total, correct
 
 

@@ -1,0 +1,42 @@
+# `make sweep` runs the main job, `make test` the tests; both set up what they need first. More arguments: make sweep ARGS="..."
+SHELL := /bin/bash
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/ready
+ARGS ?=
+
+.PHONY: sweep test verify-navigation benchmark lint lock setup
+.DEFAULT_GOAL := sweep
+
+sweep: $(READY)
+	$(BIN)/python -m peps_jax.sweep $(ARGS)
+
+test: $(READY)
+	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal --durations 10 $(ARGS)
+
+verify-navigation: $(READY)
+	$(BIN)/python benchmarks/verify_navigation.py $(ARGS)
+
+benchmark: $(READY)
+	$(BIN)/python benchmarks/speed.py $(ARGS)
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+setup: $(READY)
+
+# redone only when what is installed would change
+$(READY): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+		{ echo 'peps_jax needs Python 3.11 or newer: make PYTHON=/path/to/python3.11 (or newer)' >&2; exit 1; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+# new versions of everything, for every platform; hatchling builds the package
+lock: $(READY)
+	$(BIN)/pip install --quiet uv
+	echo hatchling | $(BIN)/uv pip compile --upgrade --universal --no-header --no-annotate --no-emit-index-url \
+		--no-emit-find-links --extra test pyproject.toml - --output-file requirements.lock

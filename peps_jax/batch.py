@@ -1,0 +1,361 @@
+"""Many cells at once: one compiled program for each structure, its cells laid over all devices.
+
+Cells whose `Config`s differ only in traced leaves share a program; environments that share code do too, because their numbers
+are leaves. On a CPU each device works through its cells one after the other, which is quicker than side by side (their
+working memory stays in the cache); an accelerator takes its cells side by side.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import psutil
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from peps_jax.config import Config
+from peps_jax.evaluate import Evaluation, evaluate
+from peps_jax.train import Result, TrainingState, finish, init, run_round, run_rounds
+
+AVAILABLE_SHARE = (
+    0.8  # of the free memory that a batch may plan with: the prediction doesn't know what other programs take
+)
+REPORTS = 40  # chunks of rounds that a training is about cut into: progress, and a place to stop, between two of them
+
+Report = Callable[[int, dict[str, np.ndarray]], None]  # (rounds done, curves (cells, rounds of the chunk))
+
+
+class Finished(NamedTuple):
+    """A cell that was trained and evaluated, as numpy arrays."""
+
+    result: Result
+    evaluation: Evaluation
+    failed: bool  # something that was learned or evaluated isn't finite
+
+
+class Times(NamedTuple):
+    """Seconds of wall clock."""
+
+    compile: float = 0.0
+    run: float = 0.0  # training, after compilation
+    evaluate: float = 0.0
+
+    def __add__(self, other: Times) -> Times:
+        return Times(*(a + b for a, b in zip(self, other, strict=True)))
+
+
+class Batch(NamedTuple):
+    """Cells that run together in one program."""
+
+    cells: tuple[int, ...]  # places in the list that was planned
+    slots: int  # cells that the program has room for, a multiple of its devices unless there are fewer cells
+    devices: tuple[jax.Device, ...]
+
+
+class MemoryNeed(NamedTuple):
+    """Predicted bytes of one cell."""
+
+    state: int  # what a training carries from round to round
+    working: int  # what a round, or the evaluation, has in use beside it at most
+
+
+class OutOfMemoryError(ValueError):
+    """Not even one cell fits."""
+
+
+def shared(config: Config) -> Config:
+    """`config` with its task's code and numbers in place of names, so that worlds which share code share a program."""
+    environment, params, belief = config.task()
+    return config.replace(env=environment, params=params, belief=belief)
+
+
+def structure(config: Config) -> Any:
+    """What decides which program a cell needs: equal for cells that differ only in the values of traced leaves."""
+    leaves, tree = jax.tree.flatten(shared(config))
+    return tree, tuple(jnp.shape(leaf) for leaf in leaves)
+
+
+def stack(cells: Sequence[Config]) -> Config:
+    """One `Config` whose every leaf has a leading axis of cells."""
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *map(shared, cells))
+
+
+# --- memory ---------------------------------------------------------------------------------------------------------------
+
+
+def memory_need(config: Config, num_episodes: int) -> MemoryNeed:
+    """Predicts a cell's bytes from shapes alone, without compiling.
+
+    `state` is exact: agent, knowledge, replay and actors, by `jax.eval_shape` of `init`. `working` walks the traced
+    program of a round (and of the evaluation) and takes the largest sum of values that are in use at the same time, as if
+    every operation wrote its result to memory. XLA fuses many of them away, so it is an upper bound; measured against
+    compiled programs it is 1 to 3 times their need. Most of it are the minibatches of a round, updates_per_round *
+    batch_size transitions, and the ensembles' hidden activations when all of them get their reward at once.
+    """
+    cell = shared(config)
+    try:
+        state = jax.eval_shape(init, cell)
+        one_round = jax.make_jaxpr(run_round)(state, jnp.zeros((), jnp.int32), cell)
+        scoring = jax.make_jaxpr(lambda state, cell: _evaluate(state, cell, num_episodes))(state, cell)
+    except OverflowError:  # sizes that an index can't count
+        return MemoryNeed(state=2**63, working=0)
+    return MemoryNeed(
+        state=sum(_size(leaf) for leaf in jax.tree.leaves(state)),
+        working=max(_most_in_use(one_round.jaxpr), _most_in_use(scoring.jaxpr)),
+    )
+
+
+def _size(value: Any) -> int:
+    """Bytes of an array, or of the shape of one."""
+    return int(np.prod(value.shape, dtype=object)) * value.dtype.itemsize
+
+
+def _most_in_use(program: Any) -> int:
+    """Bytes of the values that `program` (a jaxpr) has in use at the same time at most, its inputs not counted."""
+    last = {value: place for place, step in enumerate(program.eqns) for value in step.invars if _is_variable(value)}
+    last |= {value: len(program.eqns) for value in program.outvars if _is_variable(value)}
+    made: set[Any] = set()
+    in_use = most = 0
+    for place, step in enumerate(program.eqns):
+        inside = max((_most_in_use(part) for part in _parts(step)), default=0)
+        in_use += sum(_size(value.aval) for value in step.outvars)
+        most = max(most, in_use + inside)
+        made.update(step.outvars)
+        over = {
+            value for value in (*step.invars, *step.outvars) if _is_variable(value) and last.get(value, -1) <= place
+        }
+        in_use -= sum(_size(value.aval) for value in over & made)
+        made -= over
+    return most
+
+
+def _is_variable(value: Any) -> bool:
+    return not hasattr(value, "val")  # a literal has a value
+
+
+def _parts(step: Any) -> Iterator[Any]:
+    """The programs inside one operation: a scan's body, a branch, a jitted function."""
+    for parameter in step.params.values():
+        for part in parameter if isinstance(parameter, tuple | list) else (parameter,):
+            part = getattr(part, "jaxpr", part)
+            if hasattr(part, "eqns"):
+                yield part
+
+
+def available_bytes(devices: Sequence[jax.Device]) -> int:
+    """Free memory for each of `devices`: the accelerator's own, or a CPU device's share of the machine's."""
+    statistics = [device.memory_stats() or {} for device in devices]
+    if all("bytes_limit" in figures for figures in statistics):
+        return min(figures["bytes_limit"] - figures.get("bytes_in_use", 0) for figures in statistics)
+    return min(psutil.virtual_memory().available, _container_bytes()) // len(devices)
+
+
+def _container_bytes() -> float:
+    """What a container's limit leaves; infinite without one. The system's own figure doesn't know of it."""
+    folder = Path("/sys/fs/cgroup")
+    try:
+        limit, used = ((folder / name).read_text().strip() for name in ("memory.max", "memory.current"))
+        return float("inf") if limit == "max" else int(limit) - int(used)
+    except (OSError, ValueError):
+        return float("inf")
+
+
+def side_by_side(devices: Sequence[jax.Device]) -> bool:
+    """Whether a device works on its cells at the same time (`vmap`) or one after the other (`lax.map`)."""
+    return devices[0].platform != "cpu"
+
+
+def cells_that_fit(need: MemoryNeed, free: int, together: bool) -> int:
+    """How many cells fit on a device with `free` bytes: k with 2 k state + w working <= AVAILABLE_SHARE * free.
+
+    The state counts twice, because a loop over cells writes a new copy beside the old; w is k if cells are worked on
+    `together`, and 1 if not.
+    """
+    free = int(AVAILABLE_SHARE * free)
+    if together:
+        return free // (2 * need.state + need.working)
+    return max(0, free - need.working) // (2 * need.state)
+
+
+def plan(
+    cells: Sequence[Config],
+    num_episodes: int = 100,
+    devices: Sequence[jax.Device] | None = None,
+    free: int | None = None,
+) -> list[Batch]:
+    """Divides cells into batches: one structure each, and split further where they would not fit in memory.
+
+    Args:
+      devices: that share the cells; all by default.
+      free: bytes that each device has; measured by default.
+
+    Raises:
+      OutOfMemoryError: one cell for each device, or even a single one, is too much.
+    """
+    devices = tuple(jax.devices() if devices is None else devices)
+    groups: dict[Any, list[int]] = {}
+    for place, cell in enumerate(cells):
+        groups.setdefault(structure(cell), []).append(place)
+    batches = []
+    for places in groups.values():
+        used = devices[: len(places)]
+        room = available_bytes(used) if free is None else free
+        need = memory_need(cells[places[0]], num_episodes)
+        fit = cells_that_fit(need, room, side_by_side(used)) * len(used)
+        if fit < 1:
+            raise OutOfMemoryError(
+                f"a {cells[places[0]].method} cell needs about {_readable(need.working + 2 * need.state)} of memory and each of "
+                f"{len(used)} devices has {_readable(AVAILABLE_SHARE * room)} for it: lower total_steps, batch_size, "
+                "updates_per_step, num_envs or the hidden sizes"
+            )
+        number = -(-len(places) // fit)
+        per_device = -(-len(places) // (number * len(used)))  # batches of one size share one program
+        slots = per_device * len(used)
+        batches += [Batch(tuple(places[i : i + slots]), slots, used) for i in range(0, len(places), slots)]
+    return batches
+
+
+def _readable(number: float) -> str:
+    for unit in ("B", "kB", "MB", "GB"):
+        if number < 1000:
+            return f"{number:.3g} {unit}"
+        number /= 1000
+    return f"{number:,.0f} TB"
+
+
+# --- programs -------------------------------------------------------------------------------------------------------------
+
+
+def _evaluate(state: TrainingState, cell: Config, num_episodes: int) -> tuple[Result, Evaluation]:
+    result = finish(state, {}, cell)
+    return result, evaluate(result, cell, num_episodes)
+
+
+def chunk_lengths(num_rounds: int) -> list[int]:
+    """Rounds between two reports, summing to `num_rounds`; of at most two different lengths, since each is a program.
+
+    A length that divides `num_rounds` is taken unless it makes many more chunks than `REPORTS`.
+    """
+    longest = max(1, num_rounds // REPORTS)
+    divisor = next(length for length in range(longest, 0, -1) if num_rounds % length == 0)
+    length = divisor if 4 * divisor >= longest else longest
+    rest = num_rounds % length
+    return [length] * (num_rounds // length) + [rest] * (rest > 0)
+
+
+class Program:
+    """A structure's training and evaluation, compiled for a number of cells on some devices."""
+
+    def __init__(self, cell: Config, slots: int, num_episodes: int, devices: Sequence[jax.Device]):
+        self._devices = tuple(devices)
+        self._sharding = NamedSharding(Mesh(np.asarray(devices), ("cells",)), P("cells"))
+        self._slots = slots
+        self._chunks = chunk_lengths(cell.num_rounds)
+        start = time.perf_counter()
+        cells = self._shapes(jax.eval_shape(lambda: stack([cell] * slots)))
+        state = self._shapes(jax.eval_shape(jax.vmap(init), cells))
+        score = lambda state, cell: _evaluate(state, cell, num_episodes)
+        lengths = sorted(set(self._chunks))
+        advance = self._over_devices(run_rounds, whole=(1,), donate=(0,))
+        lowered = [
+            self._over_devices(init).lower(cells),
+            self._over_devices(score).lower(state, cells),
+            *(advance.lower(state, jax.ShapeDtypeStruct((length,), jnp.int32), cells) for length in lengths),
+        ]
+        with ThreadPoolExecutor() as pool:  # the compiler works outside Python's lock
+            self._init, self._evaluate, *rounds = pool.map(lambda program: program.compile(), lowered)
+        self._advance = dict(zip(lengths, rounds, strict=True))
+        self.compile_seconds = time.perf_counter() - start
+
+    def _shapes(self, tree: Any) -> Any:
+        return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=self._sharding), tree)
+
+    def _over_devices(
+        self, function: Callable[..., Any], whole: tuple[int, ...] = (), donate: tuple[int, ...] = ()
+    ) -> Any:
+        """`function` of one cell, jitted for all: arguments and results have an axis of cells, but for arguments `whole`.
+
+        What is whole stays unbatched inside, so that a round writes one slice of every replay and no scatter.
+        """
+
+        def on_device(*arguments: Any) -> Any:
+            batched = [argument for place, argument in enumerate(arguments) if place not in whole]
+
+            def one(batched: list[Any]) -> Any:
+                rest = iter(batched)
+                return function(
+                    *(arguments[place] if place in whole else next(rest) for place in range(len(arguments)))
+                )
+
+            return jax.vmap(one)(batched) if side_by_side(self._devices) else jax.lax.map(one, batched)
+
+        def on_all(*arguments: Any) -> Any:
+            specs = tuple(P() if place in whole else P("cells") for place in range(len(arguments)))
+            mapped = jax.shard_map(
+                on_device, mesh=self._sharding.mesh, in_specs=specs, out_specs=P("cells"), check_vma=False
+            )
+            return mapped(*arguments)
+
+        return jax.jit(on_all, donate_argnums=donate)
+
+    def run(self, cells: Sequence[Config], report: Report = lambda done, curves: None) -> tuple[list[Finished], Times]:
+        """Trains and evaluates `cells`, at most `slots`, and tells `report` after every chunk of rounds."""
+        number = len(cells)
+        padded = [*cells, *[cells[-1]] * (self._slots - number)]  # every device gets as many; what is added is dropped
+        leaves = jax.device_put(stack(padded), self._sharding)
+        start = time.perf_counter()
+        state, done, chunks = self._init(leaves), 0, []
+        for length in self._chunks:
+            state, curves = self._advance[length](state, jnp.arange(done, done + length, dtype=jnp.int32), leaves)
+            chunks.append({name: values[:number] for name, values in jax.device_get(curves).items()})
+            done += length
+            report(done, chunks[-1])
+        trained = time.perf_counter()
+        results, evaluations = jax.device_get(self._evaluate(state, leaves))
+        times = Times(run=trained - start, evaluate=time.perf_counter() - trained)
+        curves = jax.tree.map(lambda *parts: np.concatenate(parts, 1), *chunks)
+        finished = []
+        for place, cell in enumerate(cells):
+            own = jax.tree.map(lambda values: values[place], (results, evaluations, curves))  # noqa: B023, used at once
+            result = own[0].replace(curves=own[2], config=cell)
+            finished.append(Finished(result, own[1], failed=not _finite((own[0].agent, own[0].knowledge, own[1]))))
+        return finished, times
+
+
+def _finite(tree: Any) -> bool:
+    return all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(tree) if np.issubdtype(leaf.dtype, np.floating))
+
+
+_PROGRAMS: dict[Any, Program] = {}  # compiled in this process, as `jax.jit` keeps its own
+
+
+def program(cell: Config, batch: Batch, num_episodes: int) -> tuple[Program, Times]:
+    """The program for `batch`, whose cells are like `cell`, and what it took: nothing if an earlier batch left it."""
+    key = structure(cell), batch.slots, batch.devices, num_episodes
+    if key in _PROGRAMS:
+        return _PROGRAMS[key], Times()
+    _PROGRAMS[key] = Program(cell, batch.slots, num_episodes, batch.devices)
+    return _PROGRAMS[key], Times(compile=_PROGRAMS[key].compile_seconds)
+
+
+def run(
+    cells: Sequence[Config],
+    num_episodes: int = 100,
+    batches: Sequence[Batch] | None = None,
+    report: Report = lambda done, curves: None,
+) -> tuple[list[Finished], Times]:
+    """Trains and evaluates all `cells`, batch by batch; the finished cells in the order given, and what it took."""
+    finished, times = {}, Times()
+    for batch in plan(cells, num_episodes) if batches is None else batches:
+        compiled, compiling = program(cells[batch.cells[0]], batch, num_episodes)
+        done, running = compiled.run([cells[place] for place in batch.cells], report)
+        finished |= dict(zip(batch.cells, done, strict=True))
+        times += compiling + running
+    return [finished[place] for place in range(len(cells))], times

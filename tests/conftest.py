@@ -1,0 +1,202 @@
+"""Strict by default: warnings are errors (pyproject.toml), arrays of different ranks don't mix, two devices on a CPU.
+
+`Line` and `Probe` are worlds with closed forms, small enough to compile in a moment.
+"""
+
+import os
+
+# before JAX starts; nearly all of a test's time is compilation, which optimizing would only prolong
+os.environ["XLA_FLAGS"] = (
+    f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2 --xla_backend_optimization_level=0"
+)
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import dataclasses
+import functools
+import math
+from typing import NamedTuple
+
+import distrax
+import jax
+import jax.numpy as jnp
+import pytest
+from flax import struct
+from jax import Array
+
+import peps_jax
+from peps_envs import ActionSpace, Box, Discrete, Environment, NextState, Step
+from peps_jax import Config
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def _lenient(function):
+    """`function` with rank promotion allowed inside: distrax mixes ranks when it samples."""
+
+    @functools.wraps(function)
+    def call(*args, **kwargs):
+        with jax.numpy_rank_promotion("allow"):
+            return function(*args, **kwargs)
+
+    return call
+
+
+distrax.Distribution.sample = _lenient(distrax.Distribution.sample)
+distrax.Distribution.sample_and_log_prob = _lenient(distrax.Distribution.sample_and_log_prob)
+
+
+class LineParams(NamedTuple):
+    """Dynamics and reward on a line."""
+
+    noise: Array | float = 0.0  # standard deviation of a step
+    slope: Array | float = 1.0  # reward per unit of s'
+    width: Array | float = 0.1  # sigma_p
+
+
+@struct.dataclass
+class Point:
+    """Where, (1,), and when."""
+
+    place: Array
+    time: Array
+
+
+@struct.dataclass
+class Gaussian(NextState):
+    """N(mean, noise^2) seen through a kernel N(0, width^2)."""
+
+    mean: Array  # (n,)
+    noise: Array
+    width: Array
+
+    def log_prob(self, perceived: Array) -> Array:
+        variance = self.noise**2 + self.width**2
+        return -0.5 * jnp.sum((perceived - self.mean) ** 2 / variance + jnp.log(2 * math.pi * variance))
+
+    def relative_log_prob(self, perceived: Array) -> Array:
+        return self.log_prob(perceived) + 0.5 * self.mean.size * jnp.log(2 * math.pi * self.width**2)
+
+    def relative_entropy(self) -> Array:
+        return 0.5 * self.mean.size * jnp.log1p(self.noise**2 / self.width**2)
+
+    def sample(self, key: Array) -> Array:
+        return self.mean + jnp.sqrt(self.noise**2 + self.width**2) * jax.random.normal(key, self.mean.shape)
+
+    def quadrature(self, points: int) -> tuple[Array, Array]:
+        raise NotImplementedError
+
+
+@dataclasses.dataclass(frozen=True)
+class Line(Environment):
+    """s' = s + 0.1 a + noise xi, r = slope s'. Ends beyond 0.25, and the time is up after `horizon` steps."""
+
+    horizon: int = 8
+
+    observation_size = 1
+    action_space = Box(1)
+    event_names = ("arrived",)
+
+    def reset(self, key: Array, params: LineParams) -> tuple[Point, Array]:
+        place = jax.random.uniform(key, (1,), minval=-0.1, maxval=0.1)
+        return Point(place, jnp.zeros((), jnp.int32)), place
+
+    def step(self, key: Array, state: Point, action: Array, params: LineParams) -> Step:
+        place = state.place + 0.1 * action + params.noise * jax.random.normal(key, (1,))
+        after = Point(place, state.time + 1)
+        arrived = place[0] > 0.25
+        late = (after.time >= self.horizon) & ~arrived
+        return Step(after, place, self.reward(state, action, after, params), arrived, late, arrived[None])
+
+    def reward(self, state: Point, action: Array, next_state: Point, params: LineParams) -> Array:
+        return params.slope * next_state.place[0]
+
+    def next_state_distribution(self, state: Point, action: Array, params: LineParams) -> Gaussian:
+        return Gaussian(state.place + 0.1 * action, jnp.asarray(params.noise), jnp.asarray(params.width))
+
+    def perceive(self, state: Point) -> Array:
+        return state.place
+
+    def perceive_observation(self, observation: Array, params: LineParams) -> Array:
+        return observation
+
+    def perception_width(self, params: LineParams) -> Array:
+        return jnp.broadcast_to(jnp.asarray(params.width), (1,))
+
+
+class ProbeParams(NamedTuple):
+    """What a probe pays."""
+
+    last: Array | float = 1.0  # reward of the last step
+    choice: Array | float = 0.0  # reward of the best action less that of the worst
+
+
+@dataclasses.dataclass(frozen=True)
+class Probe(Environment):
+    """`horizon` steps that are told apart, and a reward at the last; then it ends, or only the time is up."""
+
+    horizon: int = 1
+    ends: bool = True
+    action_space: ActionSpace = Box(1)
+
+    observation_size = 1
+
+    def _point(self, time: Array) -> Point:
+        return Point(jnp.minimum(time, self.horizon - 1).astype(jnp.float32)[None], time)
+
+    def reset(self, key: Array, params: ProbeParams) -> tuple[Point, Array]:
+        state = self._point(jnp.zeros((), jnp.int32))
+        return state, state.place
+
+    def step(self, key: Array, state: Point, action: Array, params: ProbeParams) -> Step:
+        after = self._point(state.time + 1)
+        over = after.time >= self.horizon
+        reward = self.reward(state, action, after, params)
+        return Step(after, after.place, reward, over & self.ends, over & (not self.ends), jnp.zeros(0, bool))
+
+    def quality(self, action: Array) -> Array:
+        """1 of the best action, 0 of the worst."""
+        if isinstance(self.action_space, Discrete):
+            return action / (self.action_space.size - 1)
+        return 1 - 0.25 * (action[0] - 1) ** 2
+
+    def reward(self, state: Point, action: Array, next_state: Point, params: ProbeParams) -> Array:
+        return params.last * (next_state.time >= self.horizon) + params.choice * self.quality(action)
+
+    def next_state_distribution(self, state: Point, action: Array, params: ProbeParams) -> Gaussian:
+        return Gaussian(self._point(state.time + 1).place, jnp.zeros(()), jnp.ones(()))
+
+    def perceive(self, state: Point) -> Array:
+        return state.place
+
+    def perceive_observation(self, observation: Array, params: ProbeParams) -> Array:
+        return observation
+
+    def perception_width(self, params: ProbeParams) -> Array:
+        return jnp.ones(1)
+
+
+# every size is given, so that no test hangs on a default
+TINY = dict(
+    method="peps", total_steps=160, num_envs=4, rollout_length=10, warmup_steps=40, batch_size=16, updates_per_step=0.1,
+    hidden_sizes=(8,), model_hidden_sizes=(8,), ensemble_size=3, dynamics_updates=3, surrogate_updates=3,
+    surrogate_batch_size=8, num_queries=20, segment_length=5, min_segment_length=1, query_strategy="information_gain",
+    candidates_per_query=10, level="none", tune_temperature=False, reward_scale=1.0,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def tiny() -> Config:
+    """A training of four rounds on D1."""
+    return Config(env="nav-d1", **TINY)
+
+
+@pytest.fixture(scope="session")
+def line() -> Config:
+    """A training of four rounds on a line, of which the human thinks that it is noisy."""
+    return Config(env=Line(), params=LineParams(), belief=LineParams(noise=0.1), **TINY)
+
+
+@pytest.fixture(scope="session")
+def train():
+    """`peps_jax.train`, compiled once for every structure."""
+    return jax.jit(peps_jax.train)

@@ -1,0 +1,128 @@
+"""Settings: one clear line for each that makes no sense, and what is traced or static."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import Line, LineParams
+
+import peps_jax
+from peps_jax import Config, grid
+from peps_jax.train import check
+
+WRONG = [
+    ("query_strategy", "information", "information_gain"),
+    ("level", "maximum", "max"),
+    ("num_envs", 0, "a whole number from 1 on"),
+    ("num_envs", 2.5, "a whole number from 1 on"),
+    ("total_steps", -1, "a whole number from 1 on"),
+    ("batch_size", 0, "a whole number from 1 on"),
+    ("ensemble_size", 0, "a whole number from 1 on"),
+    ("num_queries", 0, "a whole number from 1 on"),
+    ("warmup_steps", -5, "0 or more"),
+    ("updates_per_step", 0.0, "above 0"),
+    ("hidden_sizes", (), "sizes from 1 on"),
+    ("hidden_sizes", (8, 0), "sizes from 1 on"),
+    ("model_hidden_sizes", (-1,), "sizes from 1 on"),
+    ("segment_length", 11, "10"),
+    ("min_segment_length", 6, "5"),
+    ("candidates_per_query", 9, "10 or more"),
+    ("lam", -0.5, "0 or more"),
+    ("lam", float("nan"), "0 or more"),
+    ("lam", "much", "0 or more"),
+    ("lam", np.array([1.0, -1.0]), "0 or more"),
+    ("temperature", -1.0, "0 or more"),
+    ("rationality", -1.0, "0 or more"),
+    ("gamma", 1.01, "from 0 to 1"),
+    ("mistake_rate", -0.1, "from 0 to 1"),
+    ("myopia", 2.0, "from 0 to 1"),
+    ("learning_rate", 0.0, "above 0"),
+    ("reward_scale", -0.1, "above 0"),
+    ("seed", -1, "from 0 on"),
+]
+
+
+def one_line(error):
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize(("field", "value", "right"), WRONG)
+def test_bad_values_get_one_line(tiny, field, value, right):
+    with pytest.raises(ValueError, match=field) as error:
+        peps_jax.train(tiny.replace(**{field: value}))
+    line = one_line(error)
+    assert line.startswith(field)
+    assert (str(value) if not isinstance(value, np.ndarray) else "-1.") in line
+    assert right in line
+
+
+def test_unknown_names_get_the_nearest(tiny):
+    with pytest.raises(ValueError, match=r"env 'nav-d11' is unknown: did you mean 'nav-d1'\?") as error:
+        peps_jax.train(tiny.replace(env="nav-d11"))
+    one_line(error)
+    with pytest.raises(ValueError, match=r"method 'pebs' is unknown: did you mean 'peps'\?") as error:
+        peps_jax.train(tiny.replace(method="pebs"))
+    one_line(error)
+    with pytest.raises(ValueError, match=r"belief 'biassed' is unknown: did you mean 'biased'\?") as error:
+        tiny.replace(belief="biassed")
+    one_line(error)
+
+
+@pytest.mark.parametrize("missing", ["params", "belief"])
+def test_an_environment_object_needs_params_and_belief(line, missing):
+    with pytest.raises(ValueError, match=f"{missing} is None") as error:
+        line.replace(**{missing: None}).task()
+    one_line(error)
+
+
+def test_a_good_configuration_passes(tiny, line):
+    for config in (tiny, line, Config(), Config(env="nav-d4", method="sac")):
+        check(config)
+
+
+def test_belief_by_name_and_by_value(tiny):
+    environment, params, belief = tiny.task()
+    assert float(belief.pit_noise) > 0, "the task's first belief is the biased one"
+    _, _, unbiased = tiny.replace(belief="unbiased").task()
+    jax.tree.map(np.testing.assert_array_equal, unbiased, params)
+    own = params.replace(sand_gain=jnp.asarray(0.5))
+    assert tiny.replace(belief=own).task()[2] is own
+    assert environment == tiny.task()[0]
+
+
+def test_rounds_cover_the_steps_and_the_queries(tiny):
+    assert (tiny.steps_per_round, tiny.num_rounds, tiny.warmup_rounds) == (40, 4, 1)
+    longer = tiny.replace(total_steps=161, warmup_steps=41, num_queries=21)
+    assert (longer.num_rounds, longer.warmup_rounds) == (5, 2)
+    assert longer.queries_per_round * longer.num_rounds >= 21
+
+
+def test_static_fields_change_the_structure_and_traced_ones_do_not(line):
+    structure = jax.tree.structure(line)
+    assert structure == jax.tree.structure(line.replace(seed=3, lam=0.1, gamma=0.5, learning_rate=1.0, temperature=2.0))
+    for change in (dict(num_envs=5), dict(method="sac"), dict(hidden_sizes=(9,)), dict(env=Line(horizon=9))):
+        assert structure != jax.tree.structure(line.replace(**change))
+
+
+def test_grid_gives_every_leaf_an_axis(line):
+    cells = grid(line, seed=[0, 1, 2], lam=[0.0, 1.0, 2.0])
+    assert all(leaf.shape[0] == 3 for leaf in jax.tree.leaves(cells))
+    np.testing.assert_array_equal(cells.lam, [0.0, 1.0, 2.0])
+    np.testing.assert_array_equal(cells.gamma, jnp.full(3, line.gamma))
+    beliefs = LineParams(noise=jnp.array([0.1, 0.2]), slope=jnp.ones(2), width=jnp.full(2, 0.1))
+    np.testing.assert_allclose(grid(line, belief=beliefs).belief.noise, [0.1, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("leaves", "message"),
+    [
+        (dict(sed=[0]), "field 'sed' is unknown: did you mean 'seed'"),
+        (dict(num_envs=[1, 2]), "num_envs is static"),
+        (dict(seed=[0, 1], lam=[1.0]), r"seed, lam have lengths \[1, 2\]"),
+    ],
+)
+def test_grid_says_what_is_wrong(line, leaves, message):
+    with pytest.raises(ValueError, match=message) as error:
+        grid(line, **leaves)
+    one_line(error)

@@ -1,0 +1,82 @@
+"""T_A: the fitted Gaussians and their entropy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import LineParams
+
+from peps_jax.parts import dynamics
+from peps_jax.parts.trajectory import Transition
+
+NUMBER = 2000
+WIDTH = 0.1
+
+
+@pytest.fixture(scope="module")
+def config(line):
+    return line.replace(
+        dynamics_updates=800, dynamics_learning_rate=5e-3, batch_size=64, model_hidden_sizes=(16,), ensemble_size=2,
+        params=LineParams(width=WIDTH),
+    )  # fmt: skip
+
+
+@jax.jit
+def fitted(noise, config):
+    """T_A of s' = s + 0.1 a + noise xi."""
+    key_data, key_noise, key_init, key_fit = jax.random.split(jax.random.key(0), 4)
+    observation, action = jax.random.uniform(key_data, (2, NUMBER, 1), minval=-1.0)
+    after = observation + 0.1 * action + noise * jax.random.normal(key_noise, (NUMBER, 1))
+    replay = Transition(observation, action, jnp.zeros(NUMBER), after, jnp.zeros(NUMBER))
+    return dynamics.fit(dynamics.init(key_init, config), replay, NUMBER, key_fit, config)
+
+
+def test_movement_is_in_units_of_the_perceptual_width(line):
+    environment, params, _ = line.task()
+    transition = Transition(jnp.array([0.2]), jnp.zeros(1), jnp.zeros(()), jnp.array([0.25]), jnp.zeros(()))
+    np.testing.assert_allclose(dynamics.movement(transition, environment, params), [0.05 / WIDTH], rtol=1e-5)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.2])
+def test_fit_finds_mean_deviation_and_entropy(config, noise):
+    state, info = fitted(noise, config)
+    observation = jnp.linspace(-0.8, 0.8, 9)[:, None]
+    action = jnp.linspace(0.9, -0.9, 9)[:, None]
+    member = jax.tree.map(lambda leaf: leaf[0], state.params)
+    prediction = dynamics.predict(member, observation, action, config)
+    np.testing.assert_allclose(prediction.mean, 0.1 * action / WIDTH, atol=0.1 + noise / WIDTH * 0.25)
+    if noise:
+        np.testing.assert_allclose(jnp.exp(prediction.log_sd), noise / WIDTH, rtol=0.2)
+    entropy = dynamics.environment_entropy(state, observation, action, config)
+    assert entropy.shape == (9,)
+    np.testing.assert_allclose(entropy, 0.5 * np.log1p((noise / WIDTH) ** 2), atol=0.01, rtol=0.25)
+    assert np.isfinite(float(info["dynamics_loss"]))
+
+
+def test_loss_is_the_negative_log_likelihood(config):
+    state = dynamics.init(jax.random.key(0), config)
+    member = jax.tree.map(lambda leaf: leaf[0], state.params)
+    observation, action, after = jnp.array([[0.1], [0.3]]), jnp.array([[0.5], [-1.0]]), jnp.array([[0.2], [0.1]])
+    batch = Transition(observation, action, jnp.zeros(2), after, jnp.zeros(2))
+    prediction = dynamics.predict(member, observation, action, config)
+    moved, sd = (after - observation) / WIDTH, jnp.exp(prediction.log_sd)
+    density = -0.5 * ((moved - prediction.mean) / sd) ** 2 - prediction.log_sd - 0.5 * np.log(2 * np.pi)
+    np.testing.assert_allclose(dynamics.loss(member, batch, config), -jnp.mean(density), rtol=1e-5)
+
+
+def test_standard_deviation_stays_within_its_bounds():
+    low = dynamics._prediction(jnp.array([0.0, -1e3])).log_sd
+    high = dynamics._prediction(jnp.array([0.0, 1e3])).log_sd
+    np.testing.assert_allclose(low, dynamics.MIN_LOG_SD, atol=1e-3)
+    assert dynamics.MAX_LOG_SD - 1e-3 <= float(high[0]) <= dynamics.MAX_LOG_SD + 1e-2
+    assert 0.5 * np.log1p(np.exp(2 * dynamics.MIN_LOG_SD)) < 2e-4
+
+
+def test_disagreement_of_members_is_no_entropy(config):
+    """Members that predict different means with tiny deviations: ignorance, not the domain's randomness."""
+    state = dynamics.init(jax.random.key(0), config)
+    params = jax.tree.map(jnp.zeros_like, state.params)
+    bias = jnp.array([[5.0, -50.0], [-5.0, -50.0]])
+    params["params"]["Dense_1"]["bias"] = bias
+    entropy = dynamics.environment_entropy(state.replace(params=params), jnp.zeros((1, 1)), jnp.zeros((1, 1)), config)
+    np.testing.assert_allclose(entropy, 0.0, atol=1e-3)

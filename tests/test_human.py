@@ -1,0 +1,85 @@
+"""The synthetic human answers by Eq. (2)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import Point
+
+from peps_jax.parts import human
+from peps_jax.parts.trajectory import Segments
+
+REPEATS = 4000
+
+
+def query(first, second, mask=None):
+    """A query about where the point was seen, step by step; it stood at 0 before each, and no action was taken."""
+    places = jnp.asarray([[first, second]], jnp.float32)[..., None]
+    before, time = jnp.zeros_like(places), jnp.zeros(places.shape[:-1], jnp.int32)
+    mask = jnp.ones(places.shape[:-1]) if mask is None else jnp.asarray([mask], jnp.float32)
+    return Segments(before, jnp.zeros_like(places), mask, Point(before, time), Point(places, time))
+
+
+def weight(place, params):
+    """l_H + r_H of a step from 0 to `place`, in plain numbers."""
+    variance = params.noise**2 + params.width**2
+    log_belief = -0.5 * (place**2 / variance + np.log(variance / params.width**2))
+    return log_belief + params.slope * place
+
+
+def share_of_first(config, segments, key=0):
+    """How often the first segment is preferred, of many answers to one query."""
+    many = jax.tree.map(lambda rows: jnp.repeat(rows, REPEATS, 0), segments)
+    return jax.jit(human.answer)(jax.random.key(key), many, config)
+
+
+def test_log_weight_is_belief_and_reward(line):
+    environment, _, belief = line.task()
+    parts = human.log_weight(environment, belief, Point(jnp.zeros(1), 0), jnp.zeros(1), Point(jnp.full(1, 0.2), 1))
+    np.testing.assert_allclose(sum(parts), weight(0.2, belief), rtol=1e-5)
+
+
+def test_segment_values_sum_up_to_the_mask(line):
+    values = human.segment_values(query([0.1, 0.2, 9.0], [0.3, 0.0, 0.1], [[1, 1, 0], [1, 1, 1]]), line)
+    expected = [sum(weight(place, line.belief) for place in places) for places in ([0.1, 0.2], [0.3, 0.0, 0.1])]
+    np.testing.assert_allclose(values[0], expected, rtol=1e-5)
+
+
+def test_myopia_weighs_the_end(line):
+    segments = query([0.1, 0.2, 9.0], [0.3, 0.0, 0.1], [[1, 1, 0], [1, 1, 1]])
+    values = human.segment_values(segments, line.replace(myopia=0.5))
+    first = 0.5 * weight(0.1, line.belief) + weight(0.2, line.belief)
+    second = 0.25 * weight(0.3, line.belief) + 0.5 * weight(0.0, line.belief) + weight(0.1, line.belief)
+    np.testing.assert_allclose(values[0], [first, second], rtol=1e-5)
+
+
+@pytest.mark.parametrize(("rationality", "mistake_rate"), [(1.0, 0.0), (3.0, 0.0), (3.0, 0.2)])
+def test_answers_follow_eq_2(line, rationality, mistake_rate):
+    config = line.replace(rationality=rationality, mistake_rate=mistake_rate)
+    segments = query([0.0, 0.1], [0.2, 0.1])
+    difference = float(np.subtract(*human.segment_values(segments, config)[0]))
+    right = 1 / (1 + np.exp(-rationality * difference))
+    probability = right * (1 - mistake_rate) + (1 - right) * mistake_rate
+    preferences = share_of_first(config, segments)
+    assert set(np.unique(preferences.answers)) <= {0.0, 1.0}
+    error = 4 * np.sqrt(probability * (1 - probability) / REPEATS)
+    assert abs(float(jnp.mean(preferences.answers)) - probability) < error
+    assert bool(jnp.all(preferences.answered == 1))
+
+
+def test_indifference_is_a_tie(line):
+    segments = query([0.0, 0.1], [0.2, 0.1])
+    difference = abs(float(np.subtract(*human.segment_values(segments, line)[0])))
+    assert bool(jnp.all(share_of_first(line.replace(indifference=1.01 * difference), segments).answers == 0.5))
+    assert not bool(jnp.any(share_of_first(line.replace(indifference=0.99 * difference), segments).answers == 0.5))
+
+
+def test_skips_where_both_are_bad(line):
+    segments = query([0.0, 0.1], [0.2, 0.1])
+    best = float(jnp.max(human.segment_values(segments, line)))
+    assert bool(jnp.all(share_of_first(line.replace(skip_below=best + 0.1), segments).answered == 0))
+    assert bool(jnp.all(share_of_first(line.replace(skip_below=best - 0.1), segments).answered == 1))
+
+
+def test_teacher_is_a_value():
+    assert human.SYNTHETIC.answer is human.answer

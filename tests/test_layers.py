@@ -1,0 +1,149 @@
+"""Who may import whom. A module that is added to the source has to be given a place here."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+# Bottom to top. A module imports from the rows below its own, and from its own row.
+LAYERS = (
+    {"peps_envs.interface"},
+    {"peps_envs.navigation"},
+    {"peps_envs.registry"},
+    {"peps_envs"},
+    {"peps_envs.brax_bridge"},
+    {"peps_jax.config"},
+    {"peps_jax.parts", "peps_jax.parts.trajectory", "peps_jax.parts.networks", "peps_jax.parts.replay"},
+    {f"peps_jax.parts.{name}" for name in ("dynamics", "human", "queries", "sac", "surrogate")},
+    {"peps_jax.methods", *(f"peps_jax.methods.{name}" for name in ("method", "peps", "sac"))},
+    {f"peps_jax.{name}" for name in ("explicability", "rollout", "train")},
+    {f"peps_jax.{name}" for name in ("evaluate", "planner", "statistics")},
+    {f"peps_jax.{name}" for name in ("batch", "results", "plots", "sweep", "reproduce")},
+)
+LAYER_OF = {module: layer for layer, modules in enumerate(LAYERS) for module in modules}
+STRANGERS = LAYERS[7]  # parts that know nothing of one another
+FRONT = "peps_jax"  # its __init__ shows what users need, of whatever layer
+
+
+def source_files(root: Path) -> dict[str, Path]:
+    """Files by module name: `peps_envs` lies under envs/, `peps_jax` at the root."""
+    modules = {}
+    for base, package in ((root / "envs", "peps_envs"), (root, "peps_jax")):
+        for path in sorted((base / package).rglob("*.py")):
+            parts = path.relative_to(base).with_suffix("").parts
+            modules[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return modules
+
+
+def imported(path: Path, module: str, modules: dict[str, Path]) -> set[str]:
+    """The project's modules that `path` imports, anywhere in it: `from peps_jax import train` means peps_jax.train."""
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            source = node.module or ""
+            if node.level:
+                above = package.split(".")[: len(package.split(".")) - node.level + 1]
+                source = ".".join([*above, *filter(None, [node.module])])
+            names = {f"{source}.{alias.name}" for alias in node.names}
+            found |= {name if name in modules else source for name in names}
+    return {name for name in found if name.split(".")[0] in ("peps_envs", "peps_jax")}
+
+
+def violations(root: Path) -> list[str]:
+    """One line for each module without a layer and each arrow that runs upwards."""
+    modules = source_files(root)
+    lines = []
+    for module, path in modules.items():
+        if module == FRONT:
+            continue
+        if module not in LAYER_OF:
+            lines.append(f"{module} has no layer: give it a place in LAYERS of tests/test_layers.py")
+            continue
+        for target in sorted(imported(path, module, modules) - {module}):
+            layer = LAYER_OF.get(target, len(LAYERS) - 1 if target == FRONT else None)
+            if layer is None:
+                continue  # it is reported as a module without a layer, or it doesn't exist
+            if layer > LAYER_OF[module]:
+                lines.append(f"{module} imports {target}, which is above it")
+            elif {module, target} <= STRANGERS:
+                lines.append(f"{module} imports {target}: parts know networks, replay and trajectory and no other part")
+    return lines
+
+
+def plant(root: Path, file: str, text: str) -> None:
+    """A copy of the source tree in which every file is empty, but `file` holds `text`."""
+    for path in [*source_files(ROOT).values(), ROOT / "peps_jax/sweep.py"]:
+        empty = root / path.relative_to(ROOT)
+        empty.parent.mkdir(parents=True, exist_ok=True)
+        empty.touch()
+    (root / file).write_text(text)
+
+
+def test_no_arrow_runs_upwards():
+    assert len(source_files(ROOT)) > 20
+    assert not violations(ROOT)
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "complaint"),
+    [
+        ("envs/peps_envs/navigation.py", "import peps_jax.config", "imports peps_jax.config, which is above it"),
+        (
+            "envs/peps_envs/interface.py",
+            "from peps_envs.registry import make",
+            "imports peps_envs.registry, which is above it",
+        ),
+        ("envs/peps_envs/navigation.py", "from . import registry", "imports peps_envs.registry, which is above it"),
+        ("peps_jax/train.py", "from peps_jax import evaluate", "imports peps_jax.evaluate, which is above it"),
+        ("peps_jax/train.py", "def late():\n    from .sweep import run", "imports peps_jax.sweep, which is above it"),
+        (
+            "peps_jax/parts/human.py",
+            "from ..methods.peps import PEPS",
+            "imports peps_jax.methods.peps, which is above it",
+        ),
+        ("peps_jax/parts/human.py", "from peps_jax import Config", "imports peps_jax, which is above it"),
+        ("peps_jax/parts/human.py", "from peps_jax.parts import sac", "and no other part"),
+        ("peps_jax/gadgets.py", "", "peps_jax.gadgets has no layer"),
+    ],
+)
+def test_a_planted_import_is_caught(tmp_path, file, line, complaint):
+    plant(tmp_path, file, line)
+    (found,) = violations(tmp_path)
+    assert complaint in found
+
+
+@pytest.mark.parametrize(
+    ("file", "line"),
+    [
+        ("peps_jax/train.py", "from peps_jax import rollout, methods"),
+        (
+            "peps_jax/parts/human.py",
+            "from peps_jax.parts import replay\nfrom peps_jax.config import Config\nimport peps_envs",
+        ),
+        ("peps_jax/sweep.py", "from peps_jax import Config, evaluate\nimport numpy"),
+        ("peps_jax/__init__.py", "from peps_jax.sweep import main"),
+    ],
+)
+def test_an_arrow_downwards_is_not(tmp_path, file, line):
+    plant(tmp_path, file, line)
+    assert not violations(tmp_path)
+
+
+def test_modules_are_named_for_what_they_are_about():
+    nameless = {"utils", "util", "helpers", "helper", "misc", "common"}
+    named = {part for module in source_files(ROOT) for part in module.split(".")}
+    named |= {path.stem for folder in ("benchmarks", "tests") for path in (ROOT / folder).rglob("*.py")}
+    assert not named & nameless
+
+
+def test_importing_the_library_imports_neither_brax_nor_matplotlib():
+    program = "import sys, peps_envs, peps_jax; print(*({'brax', 'matplotlib'} & set(sys.modules)))"
+    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert not printed.split()

@@ -1,0 +1,108 @@
+"""What is worth asking, and what a candidate is."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import Point
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from peps_jax.parts import queries
+from peps_jax.parts.trajectory import Trajectory, Transition
+
+logits = hnp.arrays(np.float32, (4, 6), elements=st.floats(-30, 30, width=32))
+
+
+@settings(max_examples=30, deadline=None)
+@given(logits)
+def test_information_gain_is_between_0_and_log_2(logits):
+    gain = queries.information_gain(jnp.asarray(logits))
+    assert gain.shape == (6,)
+    assert bool(jnp.all((gain >= 0) & (gain <= math.log(2) + 1e-5)))
+
+
+def test_information_gain_is_0_where_members_agree():
+    agree = jnp.array([[-50.0, -1.0, 0.0, 3.0, 50.0]] * 3)
+    np.testing.assert_allclose(queries.information_gain(agree), 0.0, atol=1e-6)
+    np.testing.assert_allclose(queries.disagreement(agree), 0.0, atol=1e-12)
+
+
+def test_information_gain_by_hand():
+    entropy = lambda p: -p * math.log(p) - (1 - p) * math.log(1 - p)
+    first, second = 0.9, 0.4
+    odds = jnp.array([[math.log(p / (1 - p))] for p in (first, second)])
+    expected = entropy((first + second) / 2) - (entropy(first) + entropy(second)) / 2
+    np.testing.assert_allclose(queries.information_gain(odds), [expected], rtol=1e-5)
+    np.testing.assert_allclose(queries.disagreement(odds), [((first - second) / 2) ** 2], rtol=1e-5)
+
+
+def test_certain_members_that_contradict_tell_log_2():
+    np.testing.assert_allclose(queries.information_gain(jnp.array([[40.0], [-40.0]])), [math.log(2)], rtol=1e-6)
+
+
+@pytest.mark.parametrize("strategy", ["information_gain", "disagreement", "random"])
+def test_a_chosen_batch_has_no_repeats(line, strategy):
+    config = line.replace(query_strategy=strategy)
+    key_logits, key_places, key = jax.random.split(jax.random.key(0), 3)
+    distinct = 2 * config.queries_per_round
+    places = jnp.tile(jax.random.normal(key_places, (distinct, 3)), (3, 1))  # each three times
+    scores = jnp.tile(3 * jax.random.normal(key_logits, (4, distinct)), (1, 3))
+    chosen = queries.choose(scores, places, key, config)
+    assert chosen.shape == (config.queries_per_round,)
+    assert len(set(np.asarray(chosen).tolist())) == config.queries_per_round
+    assert len(set((np.asarray(chosen) % distinct).tolist())) == config.queries_per_round, "a near-duplicate was taken"
+
+
+def test_the_most_informative_comes_first(line):
+    scores = jnp.array([[0.0, 5.0, 0.1, 1.0, 2.0, 0.2, 0.3], [0.0, -5.0, 0.1, -1.0, 2.0, 0.2, 0.3]])
+    chosen = queries.choose(scores, jnp.arange(7.0)[:, None], jax.random.key(0), line)
+    assert chosen[0] == 1
+    assert chosen[1] == 3
+
+
+def collected(steps=10, num_envs=3, ends=()):
+    """A trajectory whose observations say where they come from: 100 environment + step."""
+    place = 100.0 * jnp.arange(num_envs)[None] + jnp.arange(steps)[:, None]
+    over = jnp.zeros((steps, num_envs), bool)
+    for step, env, kind in ends:
+        over = over.at[step, env].set(kind == "truncated")
+    terminated = jnp.zeros((steps, num_envs))
+    for step, env, kind in ends:
+        terminated = terminated.at[step, env].set(float(kind == "terminated"))
+    place = place[..., None]
+    point = Point(place, jnp.zeros((steps, num_envs), jnp.int32))
+    transition = Transition(place, jnp.zeros_like(place), jnp.zeros((steps, num_envs)), place + 1, terminated)
+    return Trajectory(transition, over, jnp.zeros((steps, num_envs, 1), bool), point, point)
+
+
+def test_candidates_are_pieces_of_one_environment(line):
+    config = line.replace(num_queries=400, min_segment_length=2)
+    pairs = jax.jit(queries.candidates)(collected(), jax.random.key(0), config)
+    number = config.queries_per_round * config.candidates_per_query
+    assert pairs.mask.shape == (number, 2, config.segment_length)
+    np.testing.assert_array_equal(jnp.diff(pairs.observation[..., 0], axis=-1), 1)
+    lengths = np.asarray(jnp.sum(pairs.mask, -1))
+    assert set(np.unique(lengths)) == {2, 3, 4, 5}
+    assert bool(jnp.all(jnp.diff(pairs.mask, axis=-1) <= 0)), "a mask that has ended doesn't start again"
+    assert set(np.unique(pairs.observation[:, :, 0] // 100)) == {0, 1, 2}
+
+
+@pytest.mark.parametrize("kind", ["terminated", "truncated"])
+def test_a_candidate_ends_with_its_episode(line, kind):
+    config = line.replace(num_queries=400, min_segment_length=5)
+    pairs = jax.jit(queries.candidates)(
+        collected(ends=[(4, 0, kind), (4, 1, kind), (4, 2, kind)]), jax.random.key(0), config
+    )
+    start = pairs.observation[:, :, 0, 0] % 100
+    expected = jnp.where(start <= 4, 5 - start, 5)
+    np.testing.assert_array_equal(jnp.sum(pairs.mask, -1), expected)
+
+
+def test_describe_ignores_what_is_masked(line):
+    pairs = queries.candidates(collected(), jax.random.key(0), line.replace(min_segment_length=1))
+    hidden = pairs._replace(observation=jnp.where(pairs.mask[..., None] > 0, pairs.observation, 1e6))
+    np.testing.assert_array_equal(queries.describe(pairs), queries.describe(hidden))
