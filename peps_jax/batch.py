@@ -84,7 +84,9 @@ def structure(config: Config) -> Any:
 
 def stack(cells: Sequence[Config]) -> Config:
     """One `Config` whose every leaf has a leading axis of cells."""
-    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *map(shared, cells))
+    return jax.tree.map(
+        lambda *leaves: jnp.asarray(np.stack([np.asarray(leaf) for leaf in leaves])), *map(shared, cells)
+    )
 
 
 # --- memory ---------------------------------------------------------------------------------------------------------------
@@ -259,7 +261,7 @@ class Program:
         self._slots = slots
         self._chunks = chunk_lengths(cell.num_rounds)
         start = time.perf_counter()
-        cells = self._shapes(jax.eval_shape(lambda: stack([cell] * slots)))
+        cells = self._shapes(stack([cell] * slots))
         state = self._shapes(jax.eval_shape(jax.vmap(init), cells))
         score = lambda state, cell: _evaluate(state, cell, num_episodes)
         lengths = sorted(set(self._chunks))

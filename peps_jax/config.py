@@ -54,7 +54,8 @@ class Config:
     num_envs: int = _static(16, "environments side by side", group="run")
     rollout_length: int = _static(25, "steps that each environment makes in a round", group="run")
     warmup_steps: int = _static(3_200, "environment steps with uniformly random actions at the start", group="run")
-    warmup_hold: int = _static(5, "steps for which each of those actions is held", group="run")
+    exploration: Any = _traced(0.2, "share of the steps after that with such actions", group="run")
+    hold_steps: int = _static(5, "steps for which such an action is held", group="run")
 
     learning_rate: Any = _traced(1e-3, "Adam's rate for policy and critics", group="sac")
     temperature: Any = _traced(0.1, "weight of the policy entropy beside Eq. (6)'s, at the end (in reward units)", group="sac")
@@ -145,7 +146,7 @@ class Config:
         for name in (
             "total_steps", "num_envs", "rollout_length", "batch_size", "ensemble_size", "dynamics_updates",
             "surrogate_updates", "surrogate_batch_size", "num_queries", "segment_length", "min_segment_length",
-            "candidates_per_query", "warmup_hold",
+            "candidates_per_query", "hold_steps",
         ):  # fmt: skip
             _require(name, getattr(self, name), lambda value: isinstance(value, int) and value >= 1, "a whole number from 1 on")
         _require("warmup_steps", self.warmup_steps, lambda value: value >= 0, "0 or more")
@@ -167,7 +168,7 @@ class Config:
             "environment_entropy_weight", "policy_entropy_weight",
         ):  # fmt: skip
             _require(name, getattr(self, name), lambda value: value >= 0, "0 or more")
-        for name in ("gamma", "myopia", "mistake_rate", "target_rate", "anneal_share"):
+        for name in ("gamma", "myopia", "mistake_rate", "target_rate", "anneal_share", "exploration"):
             _require(name, getattr(self, name), lambda value: (value >= 0) & (value <= 1), "from 0 to 1")
         for name in ("learning_rate", "dynamics_learning_rate", "surrogate_learning_rate", "reward_scale"):
             _require(name, getattr(self, name), lambda value: value > 0, "above 0")

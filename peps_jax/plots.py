@@ -18,7 +18,7 @@ from peps_envs.navigation import Navigation, NavigationParams, NavigationState
 from peps_jax import methods
 from peps_jax.config import Config
 from peps_jax.parts import human, surrogate
-from peps_jax.results import Row
+from peps_jax.results import PICTURES, Row
 from peps_jax.train import Result
 
 if TYPE_CHECKING:
@@ -117,7 +117,8 @@ def learning_curves(rows: Sequence[Row]) -> Figure | None:
                     shown.append(_curve(axes, members, curve))
             shown = np.concatenate(shown)
             if shown.size:  # the first, random rounds may be far below all that follows
-                axes.set_ylim(max(axes.get_ylim()[0], shown.min() - 0.25 * (np.ptp(shown) + 10)), None)
+                bottom = max(axes.get_ylim()[0], shown.min() - 0.25 * (np.ptp(shown) + 10))
+                axes.set_ylim(bottom, shown.max() + 0.08 * (shown.max() - bottom) + 1e-6)
             else:
                 axes.text(0.5, 0.5, "no episode ended", transform=axes.transAxes, ha="center", color=QUIET, fontsize=8)
             if line == 0:
@@ -187,9 +188,8 @@ def _frontier_line(axes: Axes, points: Sequence[Sequence[Row]], method: str) -> 
     )  # fmt: skip
     if methods.get(method).uses_lam:
         for members, place in zip(points, means, strict=True):
-            axes.annotate(
-                f"λ = {members[0].cell.lam:g}", place, (6, 6), textcoords="offset points", fontsize=7, color=INK
-            )
+            name = f"λ = {members[0].cell.lam:g}"
+            axes.annotate(name, place, (0, 7), textcoords="offset points", ha="center", fontsize=7, color=INK)
 
 
 # --- maps -----------------------------------------------------------------------------------------------------------------
@@ -201,6 +201,7 @@ def _map(axes: Axes, params: NavigationParams, heat: bool = False) -> None:
     On a `heat` map ice and sand are outlines, for the heat to be seen.
     """
     from matplotlib.patches import Rectangle
+    from matplotlib.patheffects import Normal, Stroke
 
     width, height = np.asarray(params.size)
     sand = "firm sand" if params.sand_gain >= FIRM else "sand"
@@ -217,8 +218,10 @@ def _map(axes: Axes, params: NavigationParams, heat: bool = False) -> None:
         style = outline if seen_through else dict(facecolor=GROUND[ground], linewidth=0)
         axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, zorder=2 if seen_through else 1, **style))
         if heat and ground != "wall":
-            name, colour = ground.split()[-1], INK if seen_through else "white"
-            axes.text((x0 + x1) / 2, (y0 + y1) / 2, name, ha="center", va="center", fontsize=7, color=colour, zorder=3)
+            place = ((x0 + x1) / 2, (y0 + y1) / 2)
+            halo = [Stroke(linewidth=1.6, foreground=INK, alpha=0.7), Normal()]  # for it to be read on every colour
+            text = dict(ha="center", va="center", fontsize=7, color="white", path_effects=halo)
+            axes.text(*place, ground.split()[-1], zorder=3, **text)
     axes.set(xlim=(-0.12, width + 0.12), ylim=(height + 0.12, -0.12), aspect="equal", xticks=[], yticks=[])
     axes.set_facecolor(GROUND["wall"])
     for spine in axes.spines.values():
@@ -359,18 +362,10 @@ def _heat(figure: Figure, axes: Axes, values: np.ndarray, params: NavigationPara
     bar.ax.tick_params(labelsize=7, colors=QUIET, labelcolor=INK)
 
 
-PICTURES: dict[str, Callable[[Sequence[Row]], Any]] = {
-    "learning_curves.png": learning_curves,
-    "frontier.png": frontier,
-    "routes.png": routes,
-    "surrogate.png": surrogate_maps,
-}
-
-
 def draw(rows: Sequence[Row], folder: Path) -> list[Path]:
     """Writes every picture that `rows` have something for."""
     written = []
-    for name, make in PICTURES.items():
+    for name, make in zip(PICTURES, (learning_curves, frontier, routes, surrogate_maps), strict=True):
         figure = make(rows)
         if figure is not None:
             figure.savefig(folder / name, dpi=DOTS)

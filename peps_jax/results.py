@@ -4,7 +4,7 @@
     results.csv      one row for each cell of the grid
     curves.npz       `env_steps` (rounds,), and every curve (cells, rounds) in the order of the rows; nan where a method has none
     cells/*.msgpack  what each training learned
-    *.png            pictures
+    *.png            pictures, see `peps_jax.plots`
 
 A method that doesn't use lambda is trained once for each environment and seed; its rows for the grid's lambdas share that
 training's numbers and file.
@@ -38,6 +38,7 @@ from peps_jax.train import Result, init
 
 MANIFEST, TABLE, CURVES, CELLS = "manifest.json", "results.csv", "curves.npz", "cells"
 PACKAGES = ("peps-jax", "jax", "jaxlib", "flax", "optax", "distrax", "chex", "numpy")
+PICTURES = ("learning_curves.png", "frontier.png", "routes.png", "surrogate.png")
 KEYS = ("env", "method", "lam", "seed")  # what tells a grid's cells apart
 
 
@@ -123,17 +124,13 @@ class Writer:
         self._head = {"command": command, "configuration": _plain(settings)} | _machine()
         self._trainings: set[str] = set()
 
-    def clear(self) -> None:
-        """Removes what an earlier sweep wrote here, and nothing else."""
-        if not holds_results(self.folder):
-            return
-        for path in (self.folder / MANIFEST, self.folder / TABLE, self.folder / CURVES):
-            path.unlink(missing_ok=True)
-        for path in (*(self.folder / CELLS).glob("*.msgpack"), *self.folder.glob("*.png")):
-            path.unlink()
-
     def save(self, rows: Sequence[Row], times: Times, env_steps: int, status: str) -> None:
-        """Writes the rows finished so far; `status` is "running", "complete" or "interrupted"."""
+        """Writes the rows finished so far; `status` is "running", "complete" or "interrupted".
+
+        The first time, it takes the place of what an earlier sweep wrote here; other files stay.
+        """
+        if not self._trainings:
+            _clear(self.folder)
         (self.folder / CELLS).mkdir(parents=True, exist_ok=True)
         for row in rows:
             if row.cell.training not in self._trainings:
@@ -151,6 +148,15 @@ class Writer:
             "cells": [_entry(row) for row in rows],
         }
         write_whole(self.folder / MANIFEST, (json.dumps(manifest, indent=1, allow_nan=False) + "\n").encode())
+
+
+def _clear(folder: Path) -> None:
+    """Removes an earlier sweep's files."""
+    if holds_results(folder):
+        for path in (folder / MANIFEST, folder / TABLE, folder / CURVES):
+            path.unlink(missing_ok=True)
+        for path in (*(folder / CELLS).glob("*.msgpack"), *(folder / name for name in PICTURES)):
+            path.unlink(missing_ok=True)
 
 
 def _machine() -> dict[str, Any]:

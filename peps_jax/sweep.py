@@ -32,6 +32,7 @@ from peps_jax.train import check
 
 PROG = "python -m peps_jax.sweep"
 FORCED_DEVICES = "--xla_force_host_platform_device_count"
+MOST = 100_000  # seeds, and evaluation episodes
 PATIENCE = 10.0  # s between two lines of progress where there is no terminal
 GRID = ("env", "method", "lam")  # fields of which a sweep takes several values
 DEMONSTRATION = {"env": ("nav-d1", "nav-d4"), "method": ("peps", "sac"), "lam": (2.4,)}
@@ -147,20 +148,14 @@ def parser() -> Parser:
         kind = {"type": _number(float, 2.4), "metavar": "X"} if name == "lam" else {"metavar": "NAME"}
         values = DEMONSTRATION[name]
         group.add_argument(f"--{name}", nargs="+", default=values, help=f"{texts[name]} [{_shown(values)}]", **kind)
-    group.add_argument(
-        "--seeds", default=2, **_options(2), help="seeds for each: --seed and those after it [2]"
-    )
+    text = "seeds for each: --seed and those after it [2]"
+    group.add_argument("--seeds", default=2, help=text, **_options(2))
 
     group = made.add_argument_group("results")
     group.add_argument("--out", default="results/sweep", metavar="DIR", help="folder to write [results/sweep]")
     group.add_argument("--overwrite", action="store_true", help="replace the results that the folder holds")
-    group.add_argument(
-        "--episodes",
-        type=WHOLE_NUMBER,
-        default=100,
-        metavar="N",
-        help="evaluation episodes, by the policy's mode [100]",
-    )
+    text = "evaluation episodes, by the policy's mode [100]"
+    group.add_argument("--episodes", default=100, help=text, **_options(100))
     group.add_argument("-h", "--help", action="help", help="show this and exit")
 
     groups = {name: made.add_argument_group(title) for name, title in TITLES.items()}
@@ -186,10 +181,11 @@ def request(arguments: Sequence[str]) -> Request:
     settings = vars(parser().parse(arguments))
     settings = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
     for name in ("seeds", "episodes"):
-        if settings[name] < 1:
-            raise ValueError(f"{name} {settings[name]} is out of range: choose a whole number from 1 on")
-    if not 0 <= settings["seed"] <= 2**31 - settings["seeds"]:
-        raise ValueError(f"seed {settings['seed']} is out of range: choose 0 to {2**31 - settings['seeds']}")
+        if not 1 <= settings[name] <= MOST:
+            raise ValueError(f"{name} {settings[name]} is out of range: choose 1 to {MOST}")
+    last = 2**31 - settings["seeds"]  # a cell's seed is a 32-bit number
+    if not 0 <= settings["seed"] <= last:
+        raise ValueError(f"seed {settings['seed']} is out of range: choose 0 to {last}")
     for name in GRID:
         settings[name] = tuple(dict.fromkeys(settings[name]))
     fields = [field.name for field in dataclasses.fields(Config) if field.name in settings and field.name not in GRID]
@@ -230,39 +226,46 @@ class Display:
     """Progress on stderr: a bar on a terminal, a line now and then elsewhere."""
 
     def __init__(self, total: int):
-        from rich.console import Console
+        from rich.console import Console, Group
+        from rich.live import Live
         from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+        from rich.text import Text
 
-        console = Console(stderr=True)
-        columns = (
-            TextColumn("{task.fields[doing]}"), BarColumn(None), TaskProgressColumn(), TimeRemainingColumn(compact=True),
-            TextColumn("{task.fields[figures]}"),
-        )  # fmt: skip
-        self._bar = Progress(*columns, console=console, disable=not console.is_terminal, speed_estimate_period=120)
-        self._task = self._bar.add_task("", total=total, doing="", figures="")
         self._total, self._done, self._figures, self._doing = total, 0, "", ""
-        self._running, self._printed = 0.0, 0.0  # seconds of training before this batch; when the last line was printed
+        console = Console(stderr=True)
+        columns = (TextColumn("{task.description}"), BarColumn(None), TaskProgressColumn(), TimeRemainingColumn())
+        self._bar = Progress(*columns, speed_estimate_period=120, expand=True)
+        self._task = self._bar.add_task("", total=total)
+        shown = lambda: Group(self._bar, Text(self._figures))
+        self._live = Live(get_renderable=shown, console=console) if console.is_terminal else None
+        self._before, self._started, self._printed = (
+            0,
+            0.0,
+            0.0,
+        )  # steps and clock at the batch's start; clock at the last line
         self._latest = {"return_": float("nan"), "explicability": float("nan")}
 
     def __enter__(self) -> Display:
-        self._bar.start()
+        if self._live:
+            self._live.start(refresh=True)
         return self
 
     def __exit__(self, *exception: Any) -> None:
-        self._bar.stop()
+        if self._live:
+            self._live.stop()
 
     def say(self, text: str) -> None:
         """What happens now."""
         self._doing = text
-        self._bar.update(self._task, doing=text)
-        if self._bar.disable:
+        self._bar.update(self._task, description=text)
+        if not self._live:
             print(text, file=sys.stderr, flush=True)
 
     def begin(self, text: str) -> None:
         """A batch starts to run."""
         self.say(text)
-        self._started = self._printed = time.perf_counter()
-        self._before = self._done
+        self._before, self._started = self._done, time.perf_counter()
+        self._printed = self._started
 
     def progress(self, env_steps: int, curves: dict[str, np.ndarray]) -> None:
         """`env_steps` more are done, and what their episodes were like on average."""
@@ -272,13 +275,13 @@ class Display:
             self._latest[name] = seen.mean() if seen.size else self._latest[name]
         now = time.perf_counter()
         speed = (self._done - self._before) / (now - self._started)
-        figures = f"{speed:,.0f} steps/s  return {self._latest['return_']:.1f}  explicability {self._latest['explicability']:.1f}"
-        self._bar.update(self._task, completed=self._done, figures=figures)
-        if self._bar.disable and (now - self._printed > PATIENCE or self._done == self._total):
+        returns, explicability = self._latest["return_"], self._latest["explicability"]
+        self._figures = f"{speed:,.0f} steps/s, return {returns:.1f}, explicability {explicability:.1f}"
+        self._bar.update(self._task, completed=self._done)
+        if not self._live and (now - self._printed > PATIENCE or self._done == self._total):
             self._printed = now
-            left = (self._total - self._done) / speed
-            share = f"{100 * self._done / self._total:.0f} %"
-            print(f"{self._doing}: {share}, {left:.0f} s left, {figures}", file=sys.stderr, flush=True)
+            share, left = 100 * self._done / self._total, (self._total - self._done) / speed
+            print(f"{self._doing}: {share:.0f} %, {left:.0f} s left, {self._figures}", file=sys.stderr, flush=True)
 
 
 def print_table(rows: Sequence[Row]) -> None:
@@ -287,11 +290,11 @@ def print_table(rows: Sequence[Row]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
     for name in ("env", "method", "lambda"):
         table.add_column(name)
-    for name in ("return", "explicability", "length", "goal", "pit", "seeds"):
-        table.add_column(name, justify="right")
+    for name in ("return", "explicability", "goal", "pit", "seeds"):
+        table.add_column(name, justify="right", no_wrap=True)
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
         lam = f"{row.cell.lam:g}" if methods.get(row.cell.method).uses_lam else "any"
@@ -301,7 +304,7 @@ def print_table(rows: Sequence[Row]) -> None:
         records = [results.record(row) for row in trainings if not row.finished.failed]
         failed = len(trainings) - len(records)
         seeds = f"{len(records)}" + (f", {failed} failed" if failed else "")
-        figures = (_spread(records, name) for name in ("return_mean", "explicability_mean", "length_mean"))
+        figures = (_spread(records, name) for name in ("return_mean", "explicability_mean"))
         table.add_row(*key, *figures, _rate(records, "goal_rate"), _rate(records, "pit_rate"), seeds)
     Console(width=None if sys.stdout.isatty() else 120).print(table)
 
@@ -344,7 +347,6 @@ class Sweep:
         """Runs batch by batch, and saves after each."""
         steps = lambda config: config.num_rounds * config.steps_per_round
         self._wanted.out.mkdir(parents=True, exist_ok=True)
-        self._writer.clear()
         with Display(sum(map(steps, self._configs))) as display:
             for number, current in enumerate(self.batches, 1):
                 cells = [self._configs[place] for place in current.cells]

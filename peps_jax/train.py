@@ -80,15 +80,17 @@ def collect_and_ask(
 ) -> tuple[TrainingState, Segments | None, dict[str, Array]]:
     """The first half of round `index`: act, remember, and choose what to ask. Queries are None from a method that asks nothing."""
     key_act, key_ask, _, _, _ = _round_keys(state, index)
-    key_act, key_warmup = jax.random.split(key_act)
+    key_act, key_hold = jax.random.split(key_act)
     parts, policy_network, _ = sac.networks(config)
 
     def act(observation: Array, key: Array, time: Array) -> Array:
         action, _ = parts.sample(policy_network.apply(state.agent.policy, observation), key)
-        # a random action is held: a walk that turns at every step hardly leaves the start
-        key_held = jax.random.fold_in(key_warmup, time // config.warmup_hold)
-        uniform = jax.vmap(parts.uniform)(jax.random.split(key_held, config.num_envs))
-        return jnp.where(index < config.warmup_rounds, uniform, action)
+        # A random action is held: a walk that turns at every step hardly leaves the start. Some are taken to the very end:
+        # what the policy has abandoned would otherwise never be seen, asked about and valued again.
+        key_uniform, key_explore = jax.random.split(jax.random.fold_in(key_hold, time // config.hold_steps))
+        uniform = jax.vmap(parts.uniform)(jax.random.split(key_uniform, config.num_envs))
+        exploring = jax.random.uniform(key_explore, (config.num_envs,)) < config.exploration
+        return jax.vmap(jnp.where)(exploring | (index < config.warmup_rounds), uniform, action)
 
     actors, trajectory, info = rollout.collect(state.actors, act, key_act, config)
     flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), trajectory.transition)

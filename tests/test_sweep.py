@@ -1,0 +1,349 @@
+"""The sweep: what it refuses, what it writes, and that a cell in a batch is the cell alone."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from collections import Counter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import peps_envs
+import peps_jax
+from peps_jax import batch, results, sweep
+
+PREFIX = "python -m peps_jax.sweep: error: "
+EPISODES = 4
+
+
+def tiny_flags(tiny) -> list[str]:
+    """The command line of the `tiny` configuration."""
+    names = (
+        "total_steps", "num_envs", "rollout_length", "warmup_steps", "batch_size", "updates_per_step", "hidden_sizes",
+        "model_hidden_sizes", "ensemble_size", "dynamics_updates", "surrogate_updates", "surrogate_batch_size", "num_queries",
+        "segment_length",
+    )  # fmt: skip
+    flags = []
+    for name in names:
+        value = getattr(tiny, name)
+        flags += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else (value,))]
+    return [*flags, "--episodes", str(EPISODES)]
+
+
+def call(arguments: list[str]) -> int:
+    """The exit code of a command line."""
+    try:
+        return sweep.main(arguments)
+    except SystemExit as exit:
+        return exit.code
+
+
+def refuse_to_compile(*arguments):
+    raise AssertionError("compiled")
+
+
+# --- bad input ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        ("--env nav-d9", ("env 'nav-d9'", "did you mean 'nav-d", "nav-d1, nav-d2, nav-d3, nav-d4")),
+        ("--env nav-d1 moon", ("env 'moon'", "known are")),
+        ("--method pesp", ("method 'pesp'", "did you mean 'peps'")),
+        ("--belief baised", ("belief 'baised'", "did you mean 'biased'")),
+        ("--query-strategy randon", ("query_strategy 'randon'", "did you mean 'random'")),
+        ("--lam 2.4 -1", ("lam -1.0", "0 or more")),
+        ("--lam nan", ("lam nan", "0 or more")),
+        ("--lam much", ("--lam", "'much' is not a number", "2.4")),
+        ("--num-envs 2.5", ("--num-envs", "'2.5' is not a whole number")),
+        ("--num-envs 0", ("num_envs 0", "from 1 on")),
+        ("--hidden-sizes 64 0", ("hidden_sizes (64, 0)",)),
+        ("--segment-length 30 --rollout-length 20", ("segment_length 30", "rollout_length is 20")),
+        ("--gamma 1.5", ("gamma 1.5", "from 0 to 1")),
+        ("--seeds 0", ("seeds 0", "choose 1 to")),
+        ("--seed -3", ("seed -3", "choose 0 to")),
+        ("--episodes 0", ("episodes 0", "choose 1 to")),
+        ("--num-env 3", ("'--num-env'", "did you mean --num-envs?")),
+        ("--lam", ("--lam", "expected at least one")),
+        ("nav-d1", ("'nav-d1' is unknown",)),
+        ("--total-steps 100000000000000", ("needs about", "lower total_steps")),
+        ("--batch-size 10000000000", ("needs about", "batch_size")),
+    ],
+)
+def test_bad_input_is_one_line(arguments, parts, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(batch, "Program", refuse_to_compile)
+    assert call([*arguments.split(), "--out", str(tmp_path / "out")]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith(PREFIX)
+    assert captured.err.count("\n") == 1
+    assert all(part in captured.err for part in parts), captured.err
+    assert not captured.out
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("file", [results.MANIFEST, results.TABLE])
+def test_a_folder_with_results_is_not_written(file, tmp_path, capsys):
+    (tmp_path / file).write_text("precious")
+    assert call(["--out", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "--overwrite" in error
+    assert [path.name for path in tmp_path.iterdir()] == [file]
+
+
+def test_a_file_is_no_folder(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert call(["--out", str(tmp_path / "file" / "out")]) == 2
+    assert "is a file" in capsys.readouterr().err
+
+
+def test_too_little_memory_is_said_before_compiling(tmp_path, capsys, monkeypatch, tiny):
+    monkeypatch.setattr(batch, "Program", refuse_to_compile)
+    monkeypatch.setattr(batch, "available_bytes", lambda devices: 10_000)
+    assert call([*tiny_flags(tiny), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "each of 2 devices has 8 kB" in error
+
+
+def test_every_field_is_a_flag(capsys):
+    assert call(["--help"]) == 0
+    text = capsys.readouterr().out.replace(",", " ")
+    for name in peps_jax.Config.__dataclass_fields__:
+        assert (f"--{name.replace('_', '-')} " in text) == (name != "params"), name
+
+
+def test_one_device_per_core_unless_told_otherwise(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--some_flag=1")
+    sweep.use_every_core()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    assert os.environ["XLA_FLAGS"] == f"--some_flag=1 --xla_force_host_platform_device_count={cores}"
+    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=7")
+    sweep.use_every_core()
+    assert os.environ["XLA_FLAGS"] == "--xla_force_host_platform_device_count=7"
+
+
+def test_importing_the_library_meets_no_device():
+    program = (
+        "import sys, peps_jax.sweep; from jax._src import xla_bridge; "
+        "print(xla_bridge.backends_are_initialized(), 'matplotlib' in sys.modules)"
+    )
+    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert printed.split() == ["False", "False"]
+
+
+# --- planning -------------------------------------------------------------------------------------------------------------
+
+
+def test_worlds_share_a_program_and_methods_do_not(tiny, monkeypatch):
+    monkeypatch.setattr(batch, "memory_need", lambda config, num_episodes: batch.MemoryNeed(1000, 1000))
+    cells = [tiny.replace(env=env, method=method) for env in ("nav-d1", "nav-d3") for method in ("peps", "sac")]
+    planned = batch.plan(cells, EPISODES, free=10**9)
+    assert [one.cells for one in planned] == [(0, 2), (1, 3)]
+
+
+def test_what_does_not_fit_is_split_into_batches_of_one_size(line):
+    cells = [line.replace(seed=seed) for seed in range(7)]
+    need = batch.memory_need(line, EPISODES)
+    two_per_device = int((need.working + 2 * 2 * need.state + 100) / batch.AVAILABLE_SHARE)
+    planned = batch.plan(cells, EPISODES, free=two_per_device)
+    assert [one.slots for one in planned] == [4, 4]
+    assert [place for one in planned for place in one.cells] == list(range(7))
+    with pytest.raises(batch.OutOfMemoryError, match="each of 2 devices"):
+        batch.plan(cells, EPISODES, free=need.working)
+
+
+def test_side_by_side_every_cell_needs_its_working_memory():
+    need = batch.MemoryNeed(state=100, working=1000)
+    free = int(10_000 / batch.AVAILABLE_SHARE)
+    assert batch.cells_that_fit(need, free, together=False) == 45
+    assert batch.cells_that_fit(need, free, together=True) == 8
+    assert batch.cells_that_fit(need, 0, together=False) == 0
+
+
+def test_predicted_memory_grows_as_what_it_counts(line):
+    need = lambda **changes: batch.memory_need(line.replace(method="sac", **changes), EPISODES)
+    base, wider, longer = need(batch_size=1024), need(batch_size=2048), need(total_steps=16_000)
+    assert 1.5 * base.working < wider.working < 2.5 * base.working
+    transition = 4 * (1 + 1 + 1 + 1 + 1)  # bytes: two observations, action, reward, terminated
+    assert longer.state - base.state == (16_000 - 160) * transition
+
+
+def test_values_in_use_at_once_are_counted():
+    kilobyte = jnp.zeros(256)
+
+    def chain(x):  # never more than an operation's argument and result
+        for _ in range(10):
+            x = jnp.sin(x)
+        return jnp.sum(x)
+
+    def fan(x):  # all ten wait for their sum
+        return jnp.sum(jnp.stack([jnp.sin(x * k) for k in range(10)]))
+
+    assert batch._most_in_use(jax.make_jaxpr(chain)(kilobyte).jaxpr) <= 2 * 1024 + 4
+    assert batch._most_in_use(jax.make_jaxpr(fan)(kilobyte).jaxpr) >= 20 * 1024
+
+
+@pytest.mark.parametrize("num_rounds", [1, 2, 4, 39, 75, 97, 400, 997, 5003, 10_000])
+def test_chunks_make_whole_trainings_of_at_most_two_programs(num_rounds):
+    chunks = batch.chunk_lengths(num_rounds)
+    assert sum(chunks) == num_rounds
+    assert len(set(chunks)) <= 2
+    assert len(chunks) <= 5 * batch.REPORTS
+
+
+# --- running --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory, tiny):
+    """A folder that a whole sweep wrote: two methods, lambdas and seeds."""
+    folder = tmp_path_factory.mktemp("sweep") / "results"
+    flags = ["--env", "nav-d1", "--method", "peps", "sac", "--lam", "1.0", "2.4", "--seeds", "2", "--seed", "3"]
+    assert call([*flags, *tiny_flags(tiny), "--out", str(folder)]) == 0
+    return folder
+
+
+def table(folder) -> list[dict[str, str]]:
+    with open(folder / results.TABLE, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.slow
+def test_a_sweep_writes_the_whole_grid(swept):
+    rows = table(swept)
+    manifest = json.loads((swept / results.MANIFEST).read_text())
+    assert [(row["method"], float(row["lam"]), int(row["seed"])) for row in rows] == [
+        (method, lam, seed) for method in ("peps", "sac") for lam in (1.0, 2.4) for seed in (3, 4)
+    ]
+    assert [row["cell"] for row in rows] == [cell["name"] for cell in manifest["cells"]]
+    assert {row["status"] for row in rows} == {"ok"}
+    for column in ("return_mean", "explicability_mean", "belief_gap_mean", "length_mean", "goal_rate", "pit_rate"):
+        assert all(np.isfinite(float(row[column])) for row in rows), column
+    assert rows[0]["explicability_mean"] != rows[2]["explicability_mean"], "lambda changes what PEPS learns"
+    sac = [{**row, "lam": "", "cell": ""} for row in rows if row["method"] == "sac"]
+    assert sac[:2] == sac[2:], "and nothing of what SAC does"
+
+    assert manifest["status"] == "complete"
+    assert manifest["configuration"]["lam"] == [1.0, 2.4]
+    assert manifest["configuration"]["rationality"] == 1.0
+    assert len(manifest["devices"]) == len(jax.devices())
+    assert manifest["env_steps"] == 6 * 160, "four trainings of PEPS and two of SAC"
+    for name in ("compile_seconds", "run_seconds", "env_steps_per_second"):
+        assert manifest[name] > 0
+    assert "jax" in manifest["versions"]
+
+    curves = np.load(swept / results.CURVES)
+    assert curves["return_"].shape == (8, 4)
+    np.testing.assert_array_equal(curves["env_steps"], [40, 80, 120, 160])
+    assert np.isfinite(curves["dynamics_loss"][:4]).all()
+    assert np.isnan(curves["dynamics_loss"][4:]).all()
+
+    files = Counter(path.suffix for path in swept.rglob("*") if path.is_file())
+    assert files == {".json": 1, ".csv": 1, ".npz": 1, ".msgpack": 6, ".png": 4}
+
+
+@pytest.mark.slow
+def test_a_loaded_cell_acts_and_scores_as_it_did(swept, tiny):
+    row = table(swept)[3]
+    assert (row["lam"], row["seed"]) == ("2.4", "4")
+    result = peps_jax.load(swept, 3)
+    assert (result.config.lam, result.config.seed, result.config.hidden_sizes) == (2.4, 4, tiny.hidden_sizes)
+    again = peps_jax.load(str(swept), "nav-d1-peps-lam2.4-seed4")
+    third = peps_jax.load(swept, {"method": "peps", "lam": 2.4, "seed": 4})
+    for other in (again, third):
+        jax.tree.map(np.testing.assert_array_equal, result.agent, other.agent)
+    assert result.act(jnp.zeros(tiny.task()[0].observation_size)).shape == (2,)
+    evaluation = jax.jit(peps_jax.evaluate, static_argnums=2)(result, result.config, EPISODES)
+    np.testing.assert_allclose(evaluation.return_.mean(), float(row["return_mean"]), rtol=1e-4)
+    np.testing.assert_allclose(evaluation.explicability.mean(), float(row["explicability_mean"]), rtol=1e-4)
+    assert result.curves["preference_accuracy"].shape == (4,)
+
+
+@pytest.mark.parametrize(
+    ("cell", "message"),
+    [
+        (8, "cell 8 is out of range: choose 0 to 7"),
+        (-1, "choose 0 to 7"),
+        ("nav-d1-peps-lam2.4-seed5", "the nearest are .*nav-d1-peps-lam2.4-seed"),
+        ({"method": "sac"}, "matches 4 of 8 cells"),
+        ({"method": "sac", "seed": 9}, "matches 0 of 8 cells"),
+        ({"sead": 3}, "did you mean 'seed'"),
+    ],
+)
+def test_a_cell_that_is_not_there(swept, cell, message):
+    with pytest.raises(ValueError, match=message):
+        peps_jax.load(swept, cell)
+
+
+def test_a_folder_without_results_is_said(tmp_path):
+    with pytest.raises(ValueError, match="holds no sweep's results"):
+        peps_jax.load(tmp_path, 0)
+
+
+def test_an_interrupted_sweep_keeps_what_is_finished(line, tmp_path, capsys, monkeypatch):
+    beliefs = {"noisy": line.belief, "true": line.params}
+    monkeypatch.setitem(peps_envs.registry._TASKS, "line", lambda: peps_envs.Task(line.env, line.params, beliefs))
+    for name in (results.TABLE, results.PICTURES[0]):
+        (tmp_path / name).write_text("an earlier run's")
+    (tmp_path / "notes.txt").write_text("mine")
+    compiled, asked = batch.program, []
+
+    def interrupt_the_second(*arguments):
+        asked.append(arguments)
+        if len(asked) == 2:
+            raise KeyboardInterrupt
+        return compiled(*arguments)
+
+    monkeypatch.setattr(batch, "program", interrupt_the_second)
+    flags = ["--env", "line", "--method", "sac", "peps", "--lam", "1.0", "2.4", "--seeds", "2", "--overwrite"]
+    assert call([*flags, *tiny_flags(line), "--out", str(tmp_path)]) == 130
+    assert f"4 of 8 cells are finished and kept in {tmp_path}" in capsys.readouterr().err
+    assert [row["cell"] for row in table(tmp_path)] == [
+        f"line-sac-lam{lam}-seed{seed}" for lam in (1.0, 2.4) for seed in (0, 1)
+    ]
+    assert json.loads((tmp_path / results.MANIFEST).read_text())["status"] == "interrupted"
+    assert peps_jax.load(tmp_path, 1).act(jnp.zeros(1)).shape == (1,)
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert not (tmp_path / results.PICTURES[0]).exists()
+
+
+@pytest.mark.slow
+def test_a_cell_alone_in_a_split_batch_and_beside_a_failing_one(line, train):
+    cells = [line.replace(method="peps", seed=seed) for seed in (3, 4, 5)]
+    cells[1] = cells[1].replace(learning_rate=float("nan"))
+    need = batch.memory_need(cells[0], EPISODES)
+    one_per_device = int((need.working + 2 * need.state + 100) / batch.AVAILABLE_SHARE)
+    batches = batch.plan(cells, EPISODES, free=one_per_device)
+    assert [one.cells for one in batches] == [(0, 1), (2,)]
+    reported = []
+    finished, times = batch.run(cells, EPISODES, batches, report=lambda done, curves: reported.append(done))
+    assert [cell.failed for cell in finished] == [False, True, False]
+    assert reported == [1, 2, 3, 4] * 2
+    assert times.run > 0
+
+    alone = train(cells[2])
+    for name, curve in alone.curves.items():
+        np.testing.assert_allclose(finished[2].result.curves[name], curve, rtol=1e-3, atol=1e-4, err_msg=name)
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
+    jax.tree.map(close, finished[2].result.agent.policy, alone.agent.policy)
+
+
+def test_a_failed_cell_is_a_row_that_says_so(tiny):
+    evaluation = peps_jax.Evaluation(
+        score=peps_jax.explicability.Score(*np.full((4, 2), np.nan)),
+        log_policy=np.zeros(2),
+        length=np.ones(2),
+        events={"goal_reached": np.array([True, False])},
+        perceived=np.zeros((2, 3, 2)),
+    )
+    finished = batch.Finished(result=None, evaluation=evaluation, failed=True)
+    record = results.record(results.Row(results.Cell("nav-d1", "peps", 2.4, 0, training="x"), finished))
+    assert record["status"] == "failed"
+    assert record["goal_rate"] == 0.5
+    assert np.isnan(record["return_mean"])
