@@ -1,0 +1,59 @@
+"""Environment steps a second of a sweep's cells on D1, compile time apart; writes benchmarks/results/speed.md.
+
+    make benchmark [ARGS="--cells 4 --steps 12000"]
+
+16 environments, one SAC update per 4 steps, batch 256. SAC at two widths of two layers, and PEPS with its default models;
+PEPS's rate is also given as a share of SAC's in the same run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import pathlib
+import time
+
+os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={len(os.sched_getaffinity(0))}")
+
+import jax
+import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
+
+from peps_jax import Config, grid, train
+
+FOLDER = pathlib.Path(__file__).parent / "results"
+
+
+def rate(config: Config, cells: int) -> tuple[float, float]:
+    """Environment steps a second summed over cells, and the compilation's seconds."""
+    mesh, spec = jax.make_mesh((jax.device_count(),), ("cells",)), PartitionSpec("cells")
+    batch = jax.device_put(grid(config, seed=np.arange(cells)), NamedSharding(mesh, spec))
+    body = lambda batch: jax.lax.map(train, batch)
+    start = time.perf_counter()
+    program = jax.jit(jax.shard_map(body, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)).lower(batch).compile()
+    compiled = time.perf_counter()
+    jax.block_until_ready(program(batch))
+    seconds = time.perf_counter() - compiled
+    return cells * config.num_rounds * config.steps_per_round / seconds, compiled - start
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--cells", type=int, default=4, help="trainings; a multiple of the number of devices")
+    parser.add_argument("--steps", type=int, default=12_000, help="environment steps of a training")
+    arguments = parser.parse_args()
+    lines = ["| training | hidden layers | environment steps a second | compilation, s |", "|---|---|---|---|"]
+    rates = {}
+    for method, width, steps in (("sac", 64, arguments.steps), ("sac", 256, arguments.steps // 4), ("peps", 64, arguments.steps)):
+        config = Config(env="nav-d1", method=method, hidden_sizes=(width, width), total_steps=steps)
+        rates[method, width], compilation = rate(config, arguments.cells)
+        lines.append(f"| {method} | {width}, {width} | {rates[method, width]:,.0f} | {compilation:.1f} |")
+    lines += ["", f"PEPS runs at {rates['peps', 64] / rates['sac', 64]:.0%} of SAC's rate; {jax.device_count()} devices, "
+              f"{arguments.cells} cells."]  # fmt: skip
+    FOLDER.mkdir(exist_ok=True)
+    (FOLDER / "speed.md").write_text("\n".join(lines) + "\n")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,205 @@
+"""What PEPS and SAC reach on D1-D4 beside the exact planner; writes benchmarks/results/navigation.{md,json}.
+
+    make verify-navigation [ARGS="--seeds 8 --steps 30000"]
+
+Trainings use the package's defaults and the seeds 0, 1, ...; defaults were tuned on seeds from 100 on. Evaluation: 100
+episodes with the policy's mode, and the same with samples beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import pathlib
+import time
+
+os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={len(os.sched_getaffinity(0))}")
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
+from scipy import stats
+
+import peps_envs
+from peps_envs.navigation import NavigationState
+from peps_jax import Config, evaluate, planner
+from peps_jax.evaluate import evaluate_policy
+from peps_jax.parts import human, surrogate
+from peps_jax.train import finish, init, run_rounds
+
+DOMAINS = ("nav-d1", "nav-d2", "nav-d3", "nav-d4")
+ROUTES = {  # the paper's Figure 2: PEPS's and SAC's
+    "nav-d1": ("detour", "along the pit"),
+    "nav-d2": ("below", "corridor"),
+    "nav-d3": ("ice", "ice"),
+    "nav-d4": ("sand", "ice"),
+}
+LAMBDAS = (0.0, 0.5, 1.0, 2.0, 2.4, 2.8)
+FOLDER = pathlib.Path(__file__).parent / "results"
+
+
+def route(domain: str, places: np.ndarray) -> str:
+    """Names the way that `places` (steps + 1, 2) take through a domain.
+
+    D1: "detour" if, past the pit, its clearance is above 0.6 on average. D2: below or above the pit. D3, D4: on which side of
+    the diagonal the way keeps its largest distance.
+    """
+    x, y = places.T
+    if domain in ("nav-d1", "nav-d2"):
+        pit = np.asarray(peps_envs.make(domain).params.pit)
+        past = y[(x > pit[0]) & (x < pit[2])]
+        if past.size == 0 or x[-1] < pit[2]:
+            return "none"
+        if domain == "nav-d1":
+            return "detour" if past.mean() - pit[3] > 0.6 else "along the pit"
+        return "below" if past.mean() > pit[1] else "corridor"
+    return "sand" if (y - x).max() > (x - y).max() else "ice"
+
+
+def measure(config: Config) -> dict[str, jax.Array]:
+    """One cell: train, evaluate, and compare r-hat with what the human feels, over everything visited."""
+    state, curves = run_rounds(init(config), jnp.arange(config.num_rounds), config)
+    result = finish(state, curves, config)
+    mode, sampled = (evaluate(result, config, 100, stochastic=stochastic) for stochastic in (False, True))
+    figures = {
+        "return": mode.return_.mean(),
+        "explicability": mode.explicability.mean(),
+        "goal": mode.goal_reached.mean(),
+        "places": mode.perceived[0],
+        "sampled_return": sampled.return_.mean(),
+        "sampled_explicability": sampled.explicability.mean(),
+    }
+    if config.method == "peps":
+        environment, params, belief = config.task()
+        rows = jax.tree.map(lambda values: values[:: max(1, values.shape[0] // 3000)], state.replay)
+        place = lambda observation: NavigationState(environment.perceive_observation(observation, params), jnp.int32(0))
+        felt = jax.vmap(lambda row: sum(human.log_weight(
+            environment, belief, place(row.observation), row.action, place(row.next_observation))))(rows)  # fmt: skip
+        figures["felt"] = felt
+        figures["predicted"] = surrogate.predict(result.knowledge.surrogate, rows.observation, rows.action, config)
+    return figures
+
+
+def run_cells(config: Config, domains: list[str], leaves: dict[str, list]) -> dict[str, np.ndarray]:
+    """`measure` for each cell, spread over the devices, one at a time on each."""
+    tasks = {domain: peps_envs.make(domain) for domain in set(domains)}
+    stack = lambda pick: jax.tree.map(lambda *values: jnp.stack(values), *[pick(tasks[domain]) for domain in domains])
+    first = tasks[domains[0]]
+    shared = config.replace(env=first.environment, params=first.params, belief=first.beliefs[first.default_belief])
+    cell = lambda index: shared.replace(
+        params=jax.tree.map(lambda values: values[index], stack(lambda task: task.params)),
+        belief=jax.tree.map(lambda values: values[index], stack(lambda task: task.beliefs[task.default_belief])),
+        **{name: jnp.asarray(values)[index] for name, values in leaves.items()},
+    )
+    mesh = jax.make_mesh((jax.device_count(),), ("cells",))
+    number = len(domains)
+    indices = jnp.arange(-(-number // jax.device_count()) * jax.device_count()) % number
+    body = lambda indices: jax.lax.map(lambda index: measure(cell(index)), indices)
+    spec = PartitionSpec("cells")
+    program = jax.jit(jax.shard_map(body, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
+    start = time.perf_counter()
+    figures = jax.tree.map(lambda values: np.asarray(values)[:number], program(jax.device_put(indices, NamedSharding(mesh, spec))))
+    print(f"  {number} trainings, {time.perf_counter() - start:.0f} s with compilation", flush=True)
+    return figures
+
+
+def interval(values: np.ndarray) -> tuple[float, float]:
+    """95 % bootstrap interval of the mean over seeds."""
+    draws = np.random.default_rng(0).choice(values, (10_000, len(values))).mean(-1)
+    return tuple(np.percentile(draws, [2.5, 97.5]))
+
+
+def bounds(domain: str, lam: float) -> dict[str, tuple[float, float, str]]:
+    """The exact planner's return, explicability and route for both objectives."""
+    task = peps_envs.make(domain)
+    belief = task.beliefs[task.default_belief]
+
+    def solved(objective: str) -> tuple[float, float, str]:
+        def run(params, belief):
+            plan = planner.solve(params, belief, objective, lam)
+            return evaluate_policy(plan.policy, task.environment, params, belief, jax.random.key(0), 20)
+
+        episodes = jax.jit(run)(task.params, belief)
+        places = np.asarray(episodes.perceived[0])
+        return float(episodes.return_.mean()), float(episodes.explicability.mean()), route(domain, places)
+
+    return {objective: solved(objective) for objective in ("return", "peps")}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--seeds", type=int, default=8, help="trainings per domain and method")
+    parser.add_argument("--lam-seeds", type=int, default=2, help="trainings per domain and lambda")
+    parser.add_argument("--steps", type=int, default=Config().total_steps, help="environment steps of a training")
+    arguments = parser.parse_args()
+    base = Config(total_steps=arguments.steps)
+    seeds = list(range(arguments.seeds))
+    lines, record = [], {"seeds": arguments.seeds, "steps": arguments.steps, "domains": {}}
+
+    print("planner", flush=True)
+    planned = {domain: bounds(domain, float(base.lam)) for domain in DOMAINS}
+    cells = [domain for domain in DOMAINS for _ in seeds]
+    measured = {}
+    for method in ("sac", "peps"):
+        print(method, flush=True)
+        measured[method] = run_cells(base.replace(method=method), cells, {"seed": seeds * len(DOMAINS)})
+
+    lines += [
+        "| domain | method | return | explicability (95 %) | sampled: return / explicability | goal, worst seed | as in Figure 2 |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for number, domain in enumerate(DOMAINS):
+        rows = slice(number * len(seeds), (number + 1) * len(seeds))
+        entry = {"planner": planned[domain]}
+        for objective, method in (("return", "sac"), ("peps", "peps")):
+            value, explicability, way = planned[domain][objective]
+            lines.append(f"| {domain} | planner, {objective} | {value:.1f} | {explicability:.1f} | | | {way} |")
+            figures = {name: values[rows] for name, values in measured[method].items()}
+            low, high = interval(figures["explicability"])
+            ways = [route(domain, places) for places in figures["places"]]
+            right = ways.count(ROUTES[domain][0 if method == "peps" else 1])
+            lines.append(
+                f"| {domain} | {method} | {figures['return'].mean():.1f} | {figures['explicability'].mean():.1f} "
+                f"({low:.1f} to {high:.1f}) | {figures['sampled_return'].mean():.1f} / "
+                f"{figures['sampled_explicability'].mean():.1f} | {figures['goal'].min():.2f} | {right} of {len(seeds)} |"
+            )
+            entry[method] = {name: figures[name].tolist() for name in figures if figures[name].ndim == 1} | {"routes": ways}
+        best, base_line = planned[domain]["peps"][1], np.mean(entry["sac"]["explicability"])
+        entry["covered"] = float((np.mean(entry["peps"]["explicability"]) - base_line) / (best - base_line))
+        entry["rank_correlation"] = [
+            float(stats.spearmanr(predicted, felt)[0])
+            for predicted, felt in zip(measured["peps"]["predicted"][rows], measured["peps"]["felt"][rows], strict=True)
+        ]
+        record["domains"][domain] = entry
+
+    lines += ["", "| domain | way from SAC's to the planner's explicability | rank correlation of r-hat and truth |", "|---|---|---|"]
+    for domain, entry in record["domains"].items():
+        lines.append(f"| {domain} | {entry['covered']:.0%} | {np.mean(entry['rank_correlation']):.2f} |")
+
+    if arguments.lam_seeds:
+        print("lambda", flush=True)
+        domains, lam_seeds = ("nav-d1", "nav-d2", "nav-d4"), range(arguments.lam_seeds)
+        points = [(domain, lam, seed) for domain in domains for lam in LAMBDAS for seed in lam_seeds]
+        figures = run_cells(
+            base.replace(method="peps"),
+            [domain for domain, _, _ in points],
+            {"lam": [lam for _, lam, _ in points], "seed": [seed for _, _, seed in points]},
+        )
+        by_lam = figures["explicability"].reshape(len(domains), len(LAMBDAS), -1).mean(-1)
+        lines += ["", "| explicability at lambda | " + " | ".join(map(str, LAMBDAS)) + " | Spearman |"]
+        lines += ["|---" * (len(LAMBDAS) + 2) + "|"]
+        for domain, values in zip(domains, by_lam, strict=True):
+            spearman = float(stats.spearmanr(LAMBDAS, values)[0])
+            record["domains"][domain]["lam"] = {"explicability": values.tolist(), "spearman": spearman}
+            lines.append(f"| {domain} | " + " | ".join(f"{value:.1f}" for value in values) + f" | {spearman:.2f} |")
+
+    FOLDER.mkdir(exist_ok=True)
+    (FOLDER / "navigation.md").write_text("\n".join(lines) + "\n")
+    (FOLDER / "navigation.json").write_text(json.dumps(record, indent=1) + "\n")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
