@@ -30,7 +30,9 @@ def rate(config: Config, cells: int) -> tuple[float, float]:
     batch = jax.device_put(grid(config, seed=np.arange(cells)), NamedSharding(mesh, spec))
     body = lambda batch: jax.lax.map(train, batch)
     start = time.perf_counter()
-    program = jax.jit(jax.shard_map(body, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)).lower(batch).compile()
+    program = (
+        jax.jit(jax.shard_map(body, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)).lower(batch).compile()
+    )
     compiled = time.perf_counter()
     jax.block_until_ready(program(batch))
     seconds = time.perf_counter() - compiled
@@ -44,7 +46,11 @@ def main() -> None:
     arguments = parser.parse_args()
     lines = ["| training | hidden layers | environment steps a second | compilation, s |", "|---|---|---|---|"]
     rates = {}
-    for method, width, steps in (("sac", 64, arguments.steps), ("sac", 256, arguments.steps // 4), ("peps", 64, arguments.steps)):
+    for method, width, steps in (
+        ("sac", 64, arguments.steps),
+        ("sac", 256, arguments.steps // 4),
+        ("peps", 64, arguments.steps),
+    ):
         config = Config(env="nav-d1", method=method, hidden_sizes=(width, width), total_steps=steps)
         rates[method, width], compilation = rate(config, arguments.cells)
         lines.append(f"| {method} | {width}, {width} | {rates[method, width]:,.0f} | {compilation:.1f} |")

@@ -100,7 +100,9 @@ def run_cells(config: Config, domains: list[str], leaves: dict[str, list]) -> di
     spec = PartitionSpec("cells")
     program = jax.jit(jax.shard_map(body, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
     start = time.perf_counter()
-    figures = jax.tree.map(lambda values: np.asarray(values)[:number], program(jax.device_put(indices, NamedSharding(mesh, spec))))
+    figures = jax.tree.map(
+        lambda values: np.asarray(values)[:number], program(jax.device_put(indices, NamedSharding(mesh, spec)))
+    )
     print(f"  {number} trainings, {time.perf_counter() - start:.0f} s with compilation", flush=True)
     return figures
 
@@ -165,7 +167,9 @@ def main() -> None:
                 f"({low:.1f} to {high:.1f}) | {figures['sampled_return'].mean():.1f} / "
                 f"{figures['sampled_explicability'].mean():.1f} | {figures['goal'].min():.2f} | {right} of {len(seeds)} |"
             )
-            entry[method] = {name: figures[name].tolist() for name in figures if figures[name].ndim == 1} | {"routes": ways}
+            entry[method] = {name: figures[name].tolist() for name in figures if figures[name].ndim == 1} | {
+                "routes": ways
+            }
         best, base_line = planned[domain]["peps"][1], np.mean(entry["sac"]["explicability"])
         entry["covered"] = float((np.mean(entry["peps"]["explicability"]) - base_line) / (best - base_line))
         entry["rank_correlation"] = [
@@ -174,7 +178,11 @@ def main() -> None:
         ]
         record["domains"][domain] = entry
 
-    lines += ["", "| domain | way from SAC's to the planner's explicability | rank correlation of r-hat and truth |", "|---|---|---|"]
+    lines += [
+        "",
+        "| domain | way from SAC's to the planner's explicability | rank correlation of r-hat and truth |",
+        "|---|---|---|",
+    ]
     for domain, entry in record["domains"].items():
         lines.append(f"| {domain} | {entry['covered']:.0%} | {np.mean(entry['rank_correlation']):.2f} |")
 

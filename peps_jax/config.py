@@ -58,7 +58,9 @@ class Config:
     hold_steps: int = _static(5, "steps for which such an action is held", group="run")
 
     learning_rate: Any = _traced(1e-3, "Adam's rate for policy and critics", group="sac")
-    temperature: Any = _traced(0.05, "weight of the policy entropy beside Eq. (6)'s, at the end (in reward units)", group="sac")
+    temperature: Any = _traced(
+        0.05, "weight of the policy entropy beside Eq. (6)'s, at the end (in reward units)", group="sac"
+    )
     initial_temperature: Any = _traced(1.0, "the same at the start: exploration fades", group="sac")
     anneal_share: Any = _traced(0.6, "share of the rounds over which the temperature fades", group="sac")
     saturation_penalty: Any = _traced(0.05, "price of a squared action before tanh (in reward units)", group="sac")
@@ -70,23 +72,33 @@ class Config:
     hidden_sizes: tuple[int, ...] = _static((64, 64), "hidden layers of policy and critics", group="sac")
 
     ensemble_size: int = _static(5, "members of the dynamics and of the surrogate ensemble", group="models")
-    model_hidden_sizes: tuple[int, ...] = _static((32, 32), "hidden layers of dynamics and surrogate networks", group="models")
+    model_hidden_sizes: tuple[int, ...] = _static(
+        (32, 32), "hidden layers of dynamics and surrogate networks", group="models"
+    )
     dynamics_learning_rate: Any = _traced(1e-3, "Adam's rate for the dynamics", group="models")
     dynamics_updates: int = _static(20, "gradient steps on the dynamics in a round", group="models")
     surrogate_learning_rate: Any = _traced(4e-3, "Adam's rate for the surrogate reward", group="models")
     surrogate_updates: int = _static(50, "gradient steps on the surrogate reward in a round", group="models")
     surrogate_batch_size: int = _static(64, "preferences in a minibatch of the surrogate's fit", group="models")
     surrogate_decay: Any = _traced(1e-4, "weight decay of the surrogate's fit", group="models")
-    level: str = _static("none", f"what pins the surrogate reward's level after the fit: {', '.join(LEVELS)}", group="models")
+    level: str = _static(
+        "none", f"what pins the surrogate reward's level after the fit: {', '.join(LEVELS)}", group="models"
+    )
 
     num_queries: int = _static(1_500, "preferences that the teacher gives in all", group="queries")
     segment_length: int = _static(5, "steps of the longest segment", group="queries")
-    min_segment_length: int = _static(2, "steps of the shortest segment (unequal lengths pin the level)", group="queries")
-    query_strategy: str = _static("information_gain", f"how queries are chosen: {', '.join(STRATEGIES)}", group="queries")
+    min_segment_length: int = _static(
+        2, "steps of the shortest segment (unequal lengths pin the level)", group="queries"
+    )
+    query_strategy: str = _static(
+        "information_gain", f"how queries are chosen: {', '.join(STRATEGIES)}", group="queries"
+    )
     candidates_per_query: int = _static(10, "candidate pairs for each query asked", group="queries")
 
     rationality: Any = _traced(1.0, "the human's coefficient on the difference in Eq. (2)'s exponents", group="human")
-    myopia: Any = _traced(1.0, "discount towards a segment's past: below 1 the human weighs its end more", group="human")
+    myopia: Any = _traced(
+        1.0, "discount towards a segment's past: below 1 the human weighs its end more", group="human"
+    )
     mistake_rate: Any = _traced(0.0, "probability of the opposite answer", group="human")
     indifference: Any = _traced(0.0, "difference below which the human calls it a tie", group="human")
     skip_below: Any = _traced(-np.inf, "sum under which both segments make the human skip the query", group="human")
@@ -148,24 +160,38 @@ class Config:
             "surrogate_updates", "surrogate_batch_size", "num_queries", "segment_length", "min_segment_length",
             "candidates_per_query", "hold_steps",
         ):  # fmt: skip
-            _require(name, getattr(self, name), lambda value: isinstance(value, int) and value >= 1, "a whole number from 1 on")
+            _require(
+                name,
+                getattr(self, name),
+                lambda value: isinstance(value, int) and value >= 1,
+                "a whole number from 1 on",
+            )
         _require("warmup_steps", self.warmup_steps, lambda value: value >= 0, "0 or more")
         _require("updates_per_step", self.updates_per_step, lambda value: value > 0, "above 0")
         for name in ("hidden_sizes", "model_hidden_sizes"):
             sizes = getattr(self, name)
-            _require(name, sizes, lambda value: len(value) > 0 and all(size >= 1 for size in value), "one or more sizes from 1 on")
+            _require(
+                name,
+                sizes,
+                lambda value: len(value) > 0 and all(size >= 1 for size in value),
+                "one or more sizes from 1 on",
+            )
         if self.segment_length > self.rollout_length:
             raise ValueError(
                 f"segment_length {self.segment_length} is longer than what a round collects: "
                 f"rollout_length is {self.rollout_length} steps; choose at most that"
             )
         if self.min_segment_length > self.segment_length:
-            raise ValueError(f"min_segment_length {self.min_segment_length} exceeds segment_length {self.segment_length}")
+            raise ValueError(
+                f"min_segment_length {self.min_segment_length} exceeds segment_length {self.segment_length}"
+            )
         if self.candidates_per_query < 10:
-            raise ValueError(f"candidates_per_query {self.candidates_per_query}: choose 10 or more, or the choice is no choice")
+            raise ValueError(
+                f"candidates_per_query {self.candidates_per_query}: choose 10 or more, or the choice is no choice"
+            )
         for name in (
-            "lam", "temperature", "saturation_penalty", "initial_temperature", "rationality", "indifference", "surrogate_decay", "surrogate_weight",
-            "environment_entropy_weight", "policy_entropy_weight",
+            "lam", "temperature", "saturation_penalty", "initial_temperature", "rationality", "indifference",
+            "surrogate_decay", "surrogate_weight", "environment_entropy_weight", "policy_entropy_weight",
         ):  # fmt: skip
             _require(name, getattr(self, name), lambda value: value >= 0, "0 or more")
         for name in ("gamma", "myopia", "mistake_rate", "target_rate", "anneal_share", "exploration"):
@@ -204,7 +230,9 @@ def grid(config: Config, **leaves: Any) -> Config:
         if name not in fields:
             raise ValueError(unknown_name("field", name, fields))
         if not fields[name].metadata.get("pytree_node", True):
-            raise ValueError(f"{name} is static: it changes the program, so its values can't share one; train each by itself")
+            raise ValueError(
+                f"{name} is static: it changes the program, so its values can't share one; train each by itself"
+            )
     batched = {name: jax.tree.map(jnp.asarray, value) if name in ("params", "belief") else jnp.asarray(value)
                for name, value in leaves.items()}  # fmt: skip
     sizes = {leaf.shape[0] for value in batched.values() for leaf in jax.tree.leaves(value)}

@@ -37,11 +37,11 @@ def run(env, state, action, steps):
 @pytest.mark.parametrize("make_key", [jax.random.key, jax.random.PRNGKey])
 def test_shows_what_the_world_does(make_key):
     env = BraxEnvironment(TASK.environment, TASK.params)
-    assert (env.observation_size, env.action_size) == (2, 2)
+    assert (env.observation_size, env.action_size) == (env.environment.observation_size, 2)
     assert isinstance(env.backend, str)
     assert env.unwrapped is env
     state = env.reset(make_key(0))
-    assert jax.tree.map(jnp.shape, (state.obs, state.reward, state.done)) == ((2,), (), ())
+    assert jax.tree.map(jnp.shape, (state.obs, state.reward, state.done)) == ((env.observation_size,), (), ())
     after = env.step(state, EAST)
     expected = TASK.environment.step(jax.random.key(0), state.pipeline_state, EAST, TASK.params)  # D1 is deterministic
     np.testing.assert_allclose(after.obs, expected.observation)
@@ -131,7 +131,7 @@ def test_eval_wrapper_counts_events_once_per_episode():
 def test_new_keys_work_in_a_batch():
     env = training.VmapWrapper(BraxEnvironment(navigation.Navigation(), noisy_params()))
     states = run(env, env.reset(jax.random.split(jax.random.key(0), 3)), jnp.zeros((3, 2)), 2)
-    assert states.obs.shape == (2, 3, 2)
+    assert states.obs.shape == (2, 3, env.observation_size)
     assert len(np.unique(states.obs[-1, :, 0])) == 3
 
 

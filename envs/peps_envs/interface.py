@@ -118,5 +118,7 @@ def event(environment: Environment, events: Array, name: str) -> Array:
       ValueError: the environment has no such event.
     """
     if name not in environment.event_names:
-        raise ValueError(f"event {name!r}: {type(environment).__name__} has {', '.join(environment.event_names) or 'none'}")
+        raise ValueError(
+            f"event {name!r}: {type(environment).__name__} has {', '.join(environment.event_names) or 'none'}"
+        )
     return jnp.asarray(events)[..., environment.event_names.index(name)]

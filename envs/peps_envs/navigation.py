@@ -225,7 +225,9 @@ class Navigation(Environment):
             events=jnp.stack([goal, pit]),
         )
 
-    def reward(self, state: NavigationState, action: Array, next_state: NavigationState, params: NavigationParams) -> Array:
+    def reward(
+        self, state: NavigationState, action: Array, next_state: NavigationState, params: NavigationParams
+    ) -> Array:
         del action  # what counts is where it led
         progress = distance(state.position, params.goal) - distance(next_state.position, params.goal)
         return (

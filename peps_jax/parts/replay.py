@@ -28,7 +28,9 @@ def init(capacity: int, environment: peps_envs.Environment) -> Transition:
 
 def add(buffer: Transition, transitions: Transition, position: Array) -> Transition:
     """Writes `transitions` (n, ...) at `position`; the buffer's rows before it are the past."""
-    return jax.tree.map(lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new, position, 0), buffer, transitions)
+    return jax.tree.map(
+        lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new, position, 0), buffer, transitions
+    )
 
 
 def sample(buffer: Transition, key: Array, shape: tuple[int, ...], filled: Array) -> Transition:

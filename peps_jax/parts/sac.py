@@ -145,7 +145,11 @@ def networks(config: Config) -> tuple[Head, MLP, MLP]:
     """The head, the policy's network and a critic's."""
     environment, _, _ = config.task()
     parts = head(environment)
-    return parts, MLP(config.hidden_sizes, parts.policy_size, output_scale=0.01), MLP(config.hidden_sizes, parts.critic_size)
+    return (
+        parts,
+        MLP(config.hidden_sizes, parts.policy_size, output_scale=0.01),
+        MLP(config.hidden_sizes, parts.critic_size),
+    )
 
 
 def init(key: Array, config: Config) -> Agent:
@@ -216,7 +220,9 @@ def target_entropy(environment: peps_envs.Environment) -> float:
     return -space.size * (1 + math.log(2.0))
 
 
-def update(agent: Agent, batch: Transition, temperature: Array, key: Array, config: Config) -> tuple[Agent, dict[str, Array]]:
+def update(
+    agent: Agent, batch: Transition, temperature: Array, key: Array, config: Config
+) -> tuple[Agent, dict[str, Array]]:
     """One step on critics, policy, targets and, if it is tuned, temperature; `batch.reward` in scaled units."""
     key_target, key_policy = jax.random.split(key)
     optimizer = optax.adam(config.learning_rate)

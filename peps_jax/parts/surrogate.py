@@ -93,7 +93,9 @@ def preference_logits(state: SurrogateState, segments: Segments, config: Config)
     return sums[..., 0] - sums[..., 1]
 
 
-def loss(params: Any, features: Array, mask: Array, answers: Array, weights: Array, config: Config) -> tuple[Array, Array]:
+def loss(
+    params: Any, features: Array, mask: Array, answers: Array, weights: Array, config: Config
+) -> tuple[Array, Array]:
     """Bradley-Terry cross-entropy of all members over queries (n, 2, steps, ...), and their accuracy; log 2 at a tie.
 
     `weights` (n, members) is how often each member sees each query.
