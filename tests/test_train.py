@@ -12,7 +12,15 @@ from peps_jax import grid
 from peps_jax.parts import human
 from peps_jax.parts.human import Teacher
 from peps_jax.parts.trajectory import Preferences
-from peps_jax.train import collect_and_ask, finish, init, learn_and_improve, run_round, run_rounds
+from peps_jax.train import (
+    annealed_temperature,
+    collect_and_ask,
+    finish,
+    init,
+    learn_and_improve,
+    run_round,
+    run_rounds,
+)
 
 CURVES = {"return_", "explicability", "belief_gap", "length", "critic_loss", "policy_entropy", "temperature"}
 LEARNED = {"dynamics_loss", "surrogate_loss", "preference_accuracy"}
@@ -235,3 +243,27 @@ def test_result_acts_by_mode_and_by_samples(line, train):
     assert actions.shape == (50, 1)
     assert float(jnp.std(actions)) > 0
     assert float(jnp.max(jnp.abs(actions))) <= 1
+
+
+def test_the_temperature_fades_geometrically(line):
+    config = line.replace(
+        initial_temperature=4.0, temperature=1.0, anneal_share=0.5, total_steps=10 * line.steps_per_round
+    )
+    at = lambda index: float(annealed_temperature(jnp.asarray(index), config))
+    assert config.num_rounds == 10
+    assert at(0) == pytest.approx(4.0)
+    assert at(2.5) == pytest.approx(2.0)  # half of the way on a logarithmic scale
+    assert at(5) == pytest.approx(1.0)
+    assert at(9) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_exploring_environments_hold_random_actions(line, share):
+    config = line.replace(warmup_steps=0, exploration=share, hold_steps=5)
+    state, _, _ = jax.jit(collect_and_ask)(init(config), jnp.asarray(0), config)
+    rows = config.rollout_length // 5 * 5
+    actions = state.replay.action[: config.steps_per_round].reshape(config.rollout_length, config.num_envs, -1)[:rows]
+    blocks = actions.reshape(-1, 5, *actions.shape[1:])
+    held = jnp.all(blocks == blocks[:, :1])
+    assert bool(held) == (share == 1.0)
+    assert len(jnp.unique(blocks[:, 0])) > 1
