@@ -24,7 +24,7 @@ from scipy import stats
 
 import peps_envs
 from peps_envs.navigation import NavigationState
-from peps_jax import Config, evaluate, planner
+from peps_jax import Config, batch, evaluate, planner
 from peps_jax.evaluate import evaluate_policy
 from peps_jax.parts import human, surrogate
 from peps_jax.train import finish, init, run_rounds
@@ -82,27 +82,16 @@ def measure(config: Config) -> dict[str, jax.Array]:
     return figures
 
 
-def run_cells(config: Config, domains: list[str], leaves: dict[str, list]) -> dict[str, np.ndarray]:
+def run_cells(configs: list[Config]) -> dict[str, np.ndarray]:
     """`measure` for each cell, spread over the devices, one at a time on each."""
-    tasks = {domain: peps_envs.make(domain) for domain in set(domains)}
-    stack = lambda pick: jax.tree.map(lambda *values: jnp.stack(values), *[pick(tasks[domain]) for domain in domains])
-    first = tasks[domains[0]]
-    shared = config.replace(env=first.environment, params=first.params, belief=first.beliefs[first.default_belief])
-    cell = lambda index: shared.replace(
-        params=jax.tree.map(lambda values: values[index], stack(lambda task: task.params)),
-        belief=jax.tree.map(lambda values: values[index], stack(lambda task: task.beliefs[task.default_belief])),
-        **{name: jnp.asarray(values)[index] for name, values in leaves.items()},
-    )
-    mesh = jax.make_mesh((jax.device_count(),), ("cells",))
-    number = len(domains)
-    indices = jnp.arange(-(-number // jax.device_count()) * jax.device_count()) % number
-    body = lambda indices: jax.lax.map(lambda index: measure(cell(index)), indices)
-    spec = PartitionSpec("cells")
+    mesh, spec = jax.make_mesh((jax.device_count(),), ("cells",)), PartitionSpec("cells")
+    number = len(configs)
+    padded = [*configs, *[configs[-1]] * (-number % jax.device_count())]
+    cells = jax.device_put(batch.stack(padded), NamedSharding(mesh, spec))
+    body = lambda cells: jax.lax.map(measure, cells)
     program = jax.jit(jax.shard_map(body, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
     start = time.perf_counter()
-    figures = jax.tree.map(
-        lambda values: np.asarray(values)[:number], program(jax.device_put(indices, NamedSharding(mesh, spec)))
-    )
+    figures = jax.tree.map(lambda values: np.asarray(values)[:number], program(cells))
     print(f"  {number} trainings, {time.perf_counter() - start:.0f} s with compilation", flush=True)
     return figures
 
@@ -142,11 +131,12 @@ def main() -> None:
 
     print("planner", flush=True)
     planned = {domain: bounds(domain, float(base.lam)) for domain in DOMAINS}
-    cells = [domain for domain in DOMAINS for _ in seeds]
     measured = {}
     for method in ("sac", "peps"):
         print(method, flush=True)
-        measured[method] = run_cells(base.replace(method=method), cells, {"seed": seeds * len(DOMAINS)})
+        measured[method] = run_cells(
+            [base.replace(env=domain, method=method, seed=seed) for domain in DOMAINS for seed in seeds]
+        )
 
     lines += [
         "| domain | method | return | explicability (95 %) | sampled: return / explicability | goal, worst seed | as in Figure 2 |",
@@ -189,11 +179,13 @@ def main() -> None:
     if arguments.lam_seeds:
         print("lambda", flush=True)
         domains, lam_seeds = ("nav-d1", "nav-d2", "nav-d4"), range(arguments.lam_seeds)
-        points = [(domain, lam, seed) for domain in domains for lam in LAMBDAS for seed in lam_seeds]
         figures = run_cells(
-            base.replace(method="peps"),
-            [domain for domain, _, _ in points],
-            {"lam": [lam for _, lam, _ in points], "seed": [seed for _, _, seed in points]},
+            [
+                base.replace(env=domain, method="peps", lam=lam, seed=seed)
+                for domain in domains
+                for lam in LAMBDAS
+                for seed in lam_seeds
+            ]
         )
         by_lam = figures["explicability"].reshape(len(domains), len(LAMBDAS), -1).mean(-1)
         lines += ["", "| explicability at lambda | " + " | ".join(map(str, LAMBDAS)) + " | Spearman |"]

@@ -24,9 +24,8 @@ from peps_jax.config import Config
 from peps_jax.evaluate import Evaluation, evaluate
 from peps_jax.train import Result, TrainingState, finish, init, run_round, run_rounds
 
-AVAILABLE_SHARE = (
-    0.8  # of the free memory that a batch may plan with: the prediction doesn't know what other programs take
-)
+# of the free memory that a batch may plan with: the prediction doesn't know what other programs take
+AVAILABLE_SHARE = 0.8
 REPORTS = 40  # chunks of rounds that a training is about cut into: progress, and a place to stop, between two of them
 
 Report = Callable[[int, dict[str, np.ndarray]], None]  # (rounds done, curves (cells, rounds of the chunk))

@@ -238,11 +238,8 @@ class Display:
         self._task = self._bar.add_task("", total=total)
         shown = lambda: Group(self._bar, Text(self._figures))
         self._live = Live(get_renderable=shown, console=console) if console.is_terminal else None
-        self._before, self._started, self._printed = (
-            0,
-            0.0,
-            0.0,
-        )  # steps and clock at the batch's start; clock at the last line
+        self._before, self._started = 0, 0.0  # steps and clock at the batch's start
+        self._printed = 0.0  # clock at the last line
         self._latest = {"return_": float("nan"), "explicability": float("nan")}
 
     def __enter__(self) -> Display:

@@ -71,9 +71,8 @@ def choose(logits: Array, descriptions: Array, key: Array, config: Config) -> Ar
         "disagreement": lambda: disagreement(logits) + 1e-9,
         "random": lambda: jax.random.uniform(key, logits.shape[1:], minval=1e-3),
     }[config.query_strategy]()
-    typical = (
-        2 * jnp.mean(jnp.var(descriptions, 0)) * descriptions.shape[1] + 1e-6
-    )  # mean squared distance of two candidates
+    # mean squared distance of two candidates
+    typical = 2 * jnp.mean(jnp.var(descriptions, 0)) * descriptions.shape[1] + 1e-6
 
     def take(score: Array, _: None) -> tuple[Array, Array]:
         best = jnp.argmax(score)
