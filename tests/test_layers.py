@@ -12,7 +12,11 @@ ROOT = Path(__file__).parents[1]
 # Bottom to top. A module imports from the rows below its own, and from its own row.
 LAYERS = (
     {"peps_envs.interface"},
-    {"peps_envs.navigation"},
+    {"peps_envs.navigation", "peps_envs.highway.vehicle"},
+    {"peps_envs.highway.collision", "peps_envs.highway.traffic"},
+    {"peps_envs.highway.simulation", "peps_envs.highway.classic"},
+    {"peps_envs.highway.environment", "peps_envs.highway.replay"},
+    {"peps_envs.highway", "peps_envs.highway.presets"},
     {"peps_envs.registry"},
     {"peps_envs"},
     {"peps_envs.brax_bridge"},
@@ -25,7 +29,7 @@ LAYERS = (
     {f"peps_jax.{name}" for name in ("batch", "results", "plots", "sweep", "reproduce")},
 )
 LAYER_OF = {module: layer for layer, modules in enumerate(LAYERS) for module in modules}
-STRANGERS = LAYERS[7]  # parts that know nothing of one another
+STRANGERS = next(layer for layer in LAYERS if "peps_jax.parts.sac" in layer)  # parts that know nothing of one another
 FRONT = "peps_jax"  # its __init__ shows what users need, of whatever layer
 
 

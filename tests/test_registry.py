@@ -90,7 +90,7 @@ def registered(monkeypatch):
 
 
 def test_the_names():
-    assert peps_envs.names() == ("nav-d1", "nav-d2", "nav-d3", "nav-d4")
+    assert peps_envs.names() == ("nav-d1", "nav-d2", "nav-d3", "nav-d4", "highway-dry", "highway-rain")
     for name in peps_envs.names():
         assert isinstance(peps_envs.make(name), Task)
 
@@ -104,7 +104,7 @@ def test_an_unknown_name_gives_the_nearest(wrong, right):
 
 
 def test_a_name_like_no_other_gives_the_list():
-    with pytest.raises(ValueError, match=r"^env 'zzz' is unknown: known are nav-d1, nav-d2, nav-d3, nav-d4$"):
+    with pytest.raises(ValueError, match=rf"^env 'zzz' is unknown: known are {', '.join(peps_envs.names())}$"):
         peps_envs.make("zzz")
 
 

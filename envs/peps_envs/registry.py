@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
-from peps_envs import navigation
+from peps_envs import highway, navigation
 from peps_envs.interface import Environment
 
 
@@ -64,5 +64,11 @@ def _navigation(domain: str) -> Callable[[], Task]:
     return lambda: Task(navigation.Navigation(), *navigation.domain(domain))
 
 
+def _highway(domain: str) -> Callable[[], Task]:
+    return lambda: Task(highway.Highway(), *highway.domain(domain))
+
+
 for _domain in navigation.DOMAINS:
     register(f"nav-{_domain}", _navigation(_domain))
+for _domain in highway.DOMAINS:
+    register(f"highway-{_domain}", _highway(_domain))
