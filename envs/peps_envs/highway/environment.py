@@ -172,6 +172,8 @@ class Highway(Environment):
             y=LANE_WIDTH * lane.astype(speed.dtype),
             heading=zeros,
             speed=jnp.full(number, speed),
+            x_rest=zeros,
+            speed_rest=zeros,
             target_lane=lane,
             target_speed=jnp.where(steered, speed, 0.0),
             wait=jax.random.randint(key_timer, (number,), 0, delay + 1),

@@ -74,7 +74,8 @@ def place(meta: Mapping[str, Any]) -> tuple[Vehicles, Drivers]:
     zeros, never = np.zeros(len(rows)), np.zeros(len(rows), bool)
     vehicles = Vehicles(
         **{name: column[name] for name in ("x", "y", "heading", "speed", "target_speed")},
-        wait=column["wait"].astype(np.int32), impact_x=zeros, impact_y=zeros, struck=never, crashed=never,
+        x_rest=zeros, speed_rest=zeros, wait=column["wait"].astype(np.int32),
+        impact_x=zeros, impact_y=zeros, struck=never, crashed=never,
         target_lane=np.asarray(vehicle.closest_lane(column["x"], column["y"], meta["lanes"])),
     )  # fmt: skip
     drivers = Drivers(**{name: column[name] for name in ("follows", "changes", "deceleration", "onset")})

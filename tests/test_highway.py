@@ -1,0 +1,492 @@
+"""The road: recorded scenarios of highway-env, the friction circle, and the scenario in which the car in front brakes."""
+
+import json
+import math
+from pathlib import Path
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import peps_envs
+from peps_envs import highway, interface
+from peps_envs.highway import collision, environment, simulation, traffic, vehicle
+from peps_envs.highway.vehicle import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER, Control
+
+RECORDINGS = {  # of highway-env 1.12.1: one behaviour at a time, and dense random traffic
+    f"{name}/{scenario}": (file, scenario)
+    for name in ("parity", "traffic")
+    for file in (np.load(Path(__file__).parent / f"data/highway_{name}.npz"),)
+    for scenario in file["scenarios"]
+}
+DRIFT = {"state": (3.6e-4, 6e-6, 3e-7, 5.5e-5)}  # of x, y, heading and speed in single precision
+
+WORLD = highway.Highway()
+reset, step = jax.jit(WORLD.reset), jax.jit(WORLD.step)
+TASKS = {name: peps_envs.make(f"highway-{name}") for name in highway.DOMAINS}
+GRAVITY = vehicle.GRAVITY
+
+property_of_all = settings(deadline=None, derandomize=True, max_examples=60)
+seeds = st.integers(0, 2**31 - 1)
+plans = st.lists(st.integers(0, 4), min_size=8, max_size=8).map(np.int32)
+
+
+def replayed(name, dtype):
+    file, scenario = RECORDINGS[name]
+    with jax.enable_x64(dtype == np.float64):
+        return highway.replay(json.loads(str(file[f"{scenario}/meta"])), file[f"{scenario}/actions"])
+
+
+def recorded(name):
+    file, scenario = RECORDINGS[name]
+    prefix = f"{scenario}/"
+    return {key.removeprefix(prefix): file[key] for key in file.files if key.startswith(prefix) and "meta" not in key}
+
+
+# Parity
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_replays_agree_with_highway_env_in_double_precision(name):
+    found, expected = replayed(name, np.float64), recorded(name)
+    assert set(found) == set(expected)
+    for key, values in expected.items():
+        assert found[key].shape == values.shape
+        if key != "obs" and values.dtype == np.float64:
+            assert found[key].dtype == np.float64
+        np.testing.assert_allclose(found[key], values, rtol=0, atol=3e-7 if key == "obs" else 1e-9, err_msg=key)
+
+
+@pytest.mark.parametrize("name", [name for name in RECORDINGS if name.startswith("parity")])
+def test_replays_agree_with_highway_env_in_single_precision(name):
+    found, expected = replayed(name, np.float32), recorded(name)
+    assert found["state"].dtype == np.float32
+    drift = np.abs(found["state"] - expected["state"]).max((0, 1))
+    assert np.all(drift <= DRIFT["state"]), drift
+    for key in ("crashed", "lane", "terminated"):
+        np.testing.assert_array_equal(found[key], expected[key], key)
+    for key in ("target", "timer", "obs", "reward", "impact"):
+        np.testing.assert_allclose(found[key], expected[key], rtol=0, atol=1e-4, err_msg=key)
+
+
+def test_a_slow_car_across_the_lane_steers_the_same_way_in_single_precision():
+    """atan(2 tan(asin(1))) is -pi/2 in single precision: the steering's limit is where the formula has its pole."""
+    for dtype in (np.float32, np.float64):
+        with jax.enable_x64(dtype == np.float64):
+            gains = simulation.highway_env().gains
+            arguments = (jnp.asarray(value, dtype) for value in (2.0, 1.2, 0.5))
+            slip = vehicle.steer(*arguments, jnp.int32(0), gains)
+            assert vehicle.steering_angle(slip) == pytest.approx(-math.pi / 3, rel=1e-6)
+
+
+@pytest.mark.parametrize(("hz", "steps"), [(5, 6), (10, 11), (15, 16), (20, 20), (30, 31), (60, 60)])
+def test_drivers_wait_as_long_as_sums_in_double_precision_say(hz, steps):
+    assert traffic.steps_until(0.0, 1 / hz) == steps
+    assert traffic.steps_until(1.1, 1 / hz) == 0
+
+
+def test_scenarios_are_checked():
+    meta = json.loads(str(RECORDINGS["parity/brake_idle"][0]["brake_idle/meta"]))
+    wrong = meta | {"vehicles": [meta["vehicles"][0], meta["vehicles"][1] | {"kind": "bicycle"}]}
+    with pytest.raises(ValueError, match="vehicle kind 'bicycle' is unknown: known are ego, brake, idm, plain"):
+        highway.replay(wrong, [1])
+    with pytest.raises(ValueError, match="the first vehicle has to be the ego"):
+        highway.replay(meta | {"vehicles": meta["vehicles"][::-1]}, [1])
+
+
+# Collisions
+
+
+@property_of_all
+@given(st.floats(-6, 6), st.floats(-4, 4), st.floats(-3.2, 3.2), st.floats(-3.2, 3.2))
+def test_cars_intersect_where_one_covers_a_point_of_the_other(x, y, first, second):
+    unit = lambda angle: (np.cos(angle), np.sin(angle))
+    still = jnp.zeros(1)
+    boxes = [tuple(jnp.asarray([value], jnp.float32) for value in pair) for pair in ((x, y), unit(first), unit(second))]
+    intersects, will_intersect, push_x, push_y = collision.meet(*boxes, (still, still))
+    assert intersects == will_intersect  # nobody moves
+
+    grid = np.stack(np.meshgrid(np.linspace(-2.5, 2.5, 81), np.linspace(-1, 1, 33)), -1).reshape(-1, 2)
+    turn = lambda angle: np.array([unit(angle), (-np.sin(angle), np.cos(angle))])
+    in_first = (grid @ turn(second) + (x, y)) @ turn(first).T
+    depth = np.minimum(2.5 - np.abs(in_first[:, 0]), 1 - np.abs(in_first[:, 1])).max()
+    if abs(depth) > 0.1:  # the grid is no finer
+        assert bool(intersects[0]) == (depth > 0)
+    if intersects[0]:  # the translation parts them, and nothing shorter does along its direction
+        apart = tuple(jnp.asarray([value], jnp.float32) for value in (x, y))
+        for share, expected in ((1.01, False), (0.9, True)):
+            moved = (apart[0] - share * push_x, apart[1] - share * push_y)
+            if np.hypot(push_x, push_y) > 0.05:
+                assert bool(collision.meet(moved, *boxes[1:], (still, still))[0][0]) == expected
+
+
+# Friction
+
+
+@property_of_all
+@given(
+    st.floats(-0.625, 0.625, width=32), st.floats(-20, 20, width=32), st.floats(-5, 40, width=32),
+    st.floats(0.0625, 1.5, width=32) | st.just(math.inf),
+)  # fmt: skip
+def test_what_is_left_of_a_command_lies_in_the_friction_circle(slip, acceleration, speed, mu):
+    asked = Control(jnp.float32(slip), jnp.float32(acceleration))
+    left = vehicle.grip(asked, jnp.float32(speed), jnp.float32(mu), jnp.float32(6))
+    if math.isinf(mu):
+        assert left == asked
+        return
+    rate = speed * float(left.slip) / (vehicle.LENGTH / 2)
+    assert abs(rate) <= mu * GRAVITY / max(speed, 1) * (1 + 1e-5)
+    assert math.hypot(speed * rate, left.acceleration) <= mu * GRAVITY * (1 + 1e-5) or speed < 1
+    assert left.acceleration <= 6
+    # a command is weakened and never reversed
+    for kept, whole in zip(left, asked, strict=True):
+        assert abs(kept) <= abs(whole)
+        assert kept * whole >= 0
+
+
+@jax.jit
+def drive(seed, plan, params):
+    """The ego's heading and speed in an episode's 8 steps, (8, 16) each, whether it crashed in them, and the road's mu (8,)."""
+    key_reset, key_mu = jax.random.split(jax.random.key(seed))
+    state, _ = WORLD.reset(key_reset, params)
+    friction = params.physics.friction
+    coefficients = friction.mean + friction.sd * jnp.clip(jax.random.normal(key_mu, (8,)), -2, 2)
+
+    def step(state, move):
+        action, mu = move
+        before = state.vehicles
+        after, (trace, _) = simulation.advance(
+            WORLD.road, before, state.drivers, state.time, action, mu, params.physics
+        )
+        join = lambda first, later: jnp.concatenate([first[None, 0], later[:, 0]])
+        path = join(before.heading, trace.heading), join(before.speed, trace.speed), trace.crashed[:, 0].any()
+        return state.replace(vehicles=after, time=state.time + 1), path
+
+    _, path = jax.lax.scan(step, state, (plan, coefficients))
+    return *path, coefficients
+
+
+@property_of_all
+@given(seeds, plans, st.sampled_from(["dry", "rain"]))
+def test_no_step_turns_or_brakes_more_than_the_road_allows(seed, plan, name):
+    heading, speed, crashed, coefficients = (np.asarray(leaf) for leaf in drive(seed, plan, TASKS[name].params))
+    for step in range(len(plan)):
+        if crashed[step]:
+            break
+        most = coefficients[step] * GRAVITY / 15
+        assert np.all(np.abs(np.diff(speed[step])) <= most + 1e-4)
+        assert np.all(np.abs(np.diff(heading[step])) <= most / np.maximum(speed[step][:-1], 1) + 1e-5)
+
+
+@property_of_all
+@given(seeds, plans)
+def test_an_infinite_coefficient_is_no_limit(seed, plan):
+    none = drive(seed, plan, highway.make_params())
+    vast = drive(seed, plan, highway.make_params(friction_mean=1e4, engine=1e4))
+    for found, expected in zip(none[:2], vast[:2], strict=True):
+        assert np.all(np.isfinite(found))
+        np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+# The scenario
+
+
+@jax.jit
+def episodes(keys, plan, params):
+    """Return, whether it crashed, and the steps, of one episode a key that follows `plan` (8,)."""
+
+    def episode(key):
+        key_reset, key_steps = jax.random.split(key)
+
+        def step(carry, move):
+            state, alive = carry
+            action, key = move
+            after = WORLD.step(key, state, action, params)
+            return (after.state, alive & ~after.terminated), (after, alive)
+
+        start = (WORLD.reset(key_reset, params)[0], jnp.ones((), bool))
+        _, (steps, alive) = jax.lax.scan(step, start, (plan, jax.random.split(key_steps, len(plan))))
+        return jnp.sum(steps.reward * alive), jnp.any(steps.terminated & alive), steps
+
+    return jax.vmap(episode)(keys)
+
+
+STEER = [IDLE, LANE_LEFT, *[IDLE] * 6]
+BRAKE_THEN_STEER = [IDLE, SLOWER, LANE_LEFT, *[IDLE] * 5]
+BRAKE = [IDLE, *[SLOWER] * 7]
+NOTHING = [IDLE] * 8
+
+
+@pytest.mark.parametrize(
+    ("name", "plan", "crashes", "return_"),
+    [
+        ("dry", STEER, (0, 0.003), None),
+        ("dry", BRAKE_THEN_STEER, (0, 0.003), None),
+        ("dry", BRAKE, (0, 0.003), None),
+        ("dry", NOTHING, (1, 1), None),
+        ("rain", STEER, (0, 0.003), (6.0, 7.0)),
+        ("rain", BRAKE_THEN_STEER, (0, 0.003), (5.6, 6.5)),
+        ("rain", BRAKE, (0.66, 0.95), (-6.0, -2.0)),
+        ("rain", NOTHING, (1, 1), None),
+    ],
+)
+def test_scripted_behaviours_crash_as_often_as_they_should(name, plan, crashes, return_):
+    params = highway.make_params(**highway.DOMAINS[name], onset=(1.0, 1.0))
+    total, crashed, _ = episodes(jax.random.split(jax.random.key(0), 1000), jnp.array(plan), params)
+    assert crashes[0] <= crashed.mean() <= crashes[1]
+    if return_:
+        assert return_[0] < total.mean() < return_[1]
+
+
+def test_the_start_is_drawn_within_its_limits():
+    params = TASKS["rain"].params
+    states, _ = jax.vmap(reset, (0, None))(jax.random.split(jax.random.key(0), 500), params)
+    vehicles, drivers = states.vehicles, states.drivers
+    drawn = {
+        "speed": vehicles.speed[:, 1], "gap": vehicles.x[:, 1] - vehicles.x[:, 0] - vehicle.LENGTH,
+        "deceleration": drivers.deceleration[:, 1], "onset": drivers.onset[:, 1],
+    }  # fmt: skip
+    for name, values in drawn.items():
+        low, high = getattr(params.scenario, name)
+        assert np.all((values >= low - 1e-4) & (values <= high + 1e-4)), name
+        assert np.ptp(values) >= 0.9 * (high - low), name
+    np.testing.assert_array_equal(vehicles.speed[:, 0], vehicles.speed[:, 1])
+    np.testing.assert_array_equal(vehicles.target_lane, 1)
+
+
+@property_of_all
+@given(seeds, plans, st.sampled_from(["dry", "rain"]))
+def test_an_episode_ends_in_one_way_only(seed, plan, name):
+    _, crashed, steps = episodes(jax.random.key(seed)[None], jnp.array(plan), TASKS[name].params)
+    for leaf in jax.tree.leaves((steps.observation, steps.reward, steps.state.vehicles)):
+        assert np.all(np.isfinite(leaf))
+    assert not np.any(steps.terminated & steps.truncated)
+    np.testing.assert_array_equal(interface.event(WORLD, steps.events, "crashed"), steps.terminated)
+    assert bool(crashed[0]) == bool(steps.terminated.any())
+    if not crashed[0]:
+        np.testing.assert_array_equal(steps.truncated[0], np.arange(8) == 7)
+        assert np.all((steps.reward >= 0) & (steps.reward <= 1))
+    sideways = np.asarray(interface.event(WORLD, steps.events, "changed_lane")).sum()
+    assert sideways == 0 or {LANE_LEFT, LANE_RIGHT} & set(plan.tolist())
+
+
+@property_of_all
+@given(seeds, plans)
+def test_observations_say_what_is_perceived(seed, plan):
+    params = TASKS["rain"].params
+    _, _, steps = episodes(jax.random.key(seed)[None], jnp.array(plan), params)
+    expected = jax.vmap(jax.vmap(WORLD.perceive))(steps.state)
+    np.testing.assert_allclose(WORLD.perceive_observation(steps.observation, params), expected, atol=1e-3)
+
+
+def test_meta_actions_move_targets():
+    params = highway.make_params()
+    state, _ = reset(jax.random.key(0), params)
+    after = jax.jit(jax.vmap(lambda action: WORLD.advance(state, action, jnp.inf, params).vehicles))(jnp.arange(5))
+    np.testing.assert_array_equal(after.target_lane[:, 0], [0, 1, 1, 1, 1])
+    np.testing.assert_array_equal(after.target_speed[:, 0], [25, 25, 25, 30, 20])
+
+
+# The reward
+
+
+def rated(**changes):
+    """The features after a step to a state with `changes` of its vehicles."""
+    params = highway.make_params()
+    state, _ = reset(jax.random.key(0), params)
+    vehicles = state.vehicles.replace(**{name: jnp.asarray(value, jnp.float32) for name, value in changes.items()})
+    return jax.jit(WORLD.rate)(state, state.replace(vehicles=vehicles), params)
+
+
+def test_features_of_the_reward():
+    start = environment.START
+    features = rated(x=[start + 15, start + 45], y=[4, 4], speed=[20, 5])
+    assert features.speed == pytest.approx(15 / 30)  # an average over the step's second
+    assert features.distance == pytest.approx(25 / 50)
+    assert features.relative_speed == pytest.approx(1 - 15 / 30 * (1 - 25 / 50))
+    assert features.lane == pytest.approx(1)
+    beside = rated(x=[start + 45, start + 45], y=[1.5, 4], speed=[20, 5])
+    assert beside.speed == 1
+    assert beside.distance == 1  # nobody is in the way
+    assert beside.relative_speed == pytest.approx(0.5)
+    assert beside.lane == pytest.approx(0.25)
+
+
+def test_the_reward_weighs_features_by_their_ratings():
+    params = highway.make_params(rating_speed=1.0, rating_distance=0.0, rating_relative_speed=0.0, rating_lane=3.0)
+    state, _ = reset(jax.random.key(0), params)
+    vehicles = state.vehicles.replace(x=state.vehicles.x.at[0].add(15.0), y=jnp.array([3.0, 4.0]))
+    after = state.replace(vehicles=vehicles)
+    assert WORLD.reward(state, IDLE, after, params) == pytest.approx(0.25 * 0.5 + 0.75 * 0.5, rel=1e-5)
+    wreck = after.replace(vehicles=vehicles.replace(crashed=jnp.array([True, True])))
+    assert WORLD.reward(state, IDLE, wreck, params) == pytest.approx(0.5 - 10, rel=1e-5)
+
+
+# The next state
+
+
+@jax.jit
+def distribution(state, action, params):
+    return WORLD.next_state_distribution(state, action, params)
+
+
+@jax.jit
+def sampled(key, state, action, params):
+    """20 000 perceived next states of the simulation, and as many of the distribution."""
+    keys, keys_see = jax.random.split(key, (2, 20_000))
+    moved = jax.vmap(lambda key: WORLD.perceive(WORLD.step(key, state, action, params).state))(keys)
+    expected = WORLD.next_state_distribution(state, action, params)
+    seen = moved + params.perception_width[None] * jax.vmap(lambda key: jax.random.normal(key, (3,)))(keys_see)
+    return moved, seen, jax.vmap(expected.sample)(keys)
+
+
+@jax.jit
+def log_probs(state, action, params, perceived):
+    return jax.vmap(WORLD.next_state_distribution(state, action, params).log_prob)(perceived)
+
+
+def after(name, *plan):
+    """The state of one episode after the actions of `plan`."""
+    params = TASKS[name].params
+    state, _ = reset(jax.random.key(3), params)
+    for action in plan:
+        state = step(jax.random.key(7), state, jnp.int32(action), params).state
+    return state
+
+
+PLACES = [
+    ("rain", (), LANE_LEFT),
+    ("rain", (IDLE,), SLOWER),
+    ("rain", (IDLE, SLOWER), LANE_LEFT),
+    ("dry", (IDLE,), SLOWER),
+]
+
+
+@pytest.mark.parametrize(("name", "plan", "action"), PLACES)
+def test_steps_follow_the_distribution(name, plan, action):
+    params, state = TASKS[name].params, after(name, *plan)
+    moved, seen, drawn = sampled(jax.random.key(0), state, jnp.int32(action), params)
+    weights, outcomes = distribution(state, action, params).quadrature(3)
+    assert weights.sum() == pytest.approx(1, abs=1e-6)
+    mean = weights @ outcomes
+    width = np.asarray(params.perception_width)
+    spread = np.sqrt(weights @ (outcomes - mean[None]) ** 2)
+    np.testing.assert_allclose(mean / width, np.mean(moved, 0) / width, atol=0.05)
+    np.testing.assert_allclose(spread / width, np.std(moved, 0) / width, rtol=0.1, atol=0.02)
+    # what is seen is as likely as what the distribution itself draws
+    found, own = (np.asarray(log_probs(state, action, params, points)) for points in (seen, drawn))
+    error = np.hypot(found.std(), own.std()) / np.sqrt(len(found))
+    assert abs(found.mean() - own.mean()) < 4 * error + 0.01
+
+
+def test_the_density_integrates_to_one():
+    params, state = TASKS["rain"].params, after("rain", IDLE)
+    expected = distribution(state, SLOWER, params)
+    centre, reach = np.asarray(expected.outcomes).mean(0), 6 * np.asarray(params.perception_width)
+    ticks = [np.linspace(c - r, c + r, 41) for c, r in zip(centre, reach, strict=True)]
+    points = np.stack(np.meshgrid(*ticks, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
+    cell = math.prod(np.diff(tick)[0] for tick in ticks)
+    assert np.exp(log_probs(state, SLOWER, params, points)).sum() * cell == pytest.approx(1, abs=1e-3)
+
+
+@property_of_all
+@given(seeds, plans, st.sampled_from(["dry", "rain"]), st.floats(-40, 40), st.floats(-8, 8))
+def test_relative_log_density_and_entropy(seed, plan, name, ahead, aside):
+    params = TASKS[name].params
+    state, _ = reset(jax.random.key(seed), params)
+    expected = distribution(state, jnp.int32(plan[0]), params)
+    relative = expected.relative_log_prob(expected.outcomes[0] + jnp.array([ahead, aside, 0.0], jnp.float32))
+    assert np.isfinite(relative)
+    assert relative <= 0
+    kernel = -np.sum(np.log(params.perception_width) + 0.5 * np.log(2 * np.pi))
+    point = expected.outcomes[1] + 0.5
+    assert expected.log_prob(point) - expected.relative_log_prob(point) == pytest.approx(kernel, rel=1e-4)
+    assert expected.relative_entropy() >= 0
+
+
+@pytest.mark.parametrize("params", [highway.make_params(), highway.make_params(friction_mean=0.5)])
+def test_without_randomness_a_prediction_scores_zero(params):
+    state, _ = reset(jax.random.key(0), params)
+    for action in (LANE_LEFT, SLOWER):
+        moved = WORLD.perceive(step(jax.random.key(1), state, jnp.int32(action), params).state)
+        expected = distribution(state, jnp.int32(action), params)
+        assert abs(expected.relative_log_prob(moved)) < 1e-5
+        assert abs(expected.relative_entropy()) < 1e-5
+
+
+@pytest.mark.parametrize("points", [3, 5, 9])
+def test_friction_nodes_keep_mean_and_variance(points):
+    nodes = environment.friction_nodes(points)
+    clipped = np.clip(np.random.default_rng(0).normal(size=400_000), -2, 2)
+    assert nodes.mean() == pytest.approx(0, abs=1e-12)
+    assert nodes.std() == pytest.approx(clipped.std(), rel=5e-3)
+
+
+def test_braking_in_the_rain_surprises_a_human_who_believes_the_road_dry():
+    task = TASKS["rain"]
+    state = after("rain", IDLE)
+    outcomes = np.asarray(distribution(state, jnp.int32(SLOWER), task.params).outcomes)
+    score = jax.jit(
+        jax.vmap(lambda outcome, mind: distribution(state, SLOWER, mind).relative_log_prob(outcome), (0, None))
+    )
+    biased, unbiased = (score(outcomes, task.beliefs[mind]).mean() for mind in ("biased", "unbiased"))
+    assert biased < unbiased - 0.3
+
+
+# Presets and transforms
+
+
+def test_the_presets():
+    assert {"highway-dry", "highway-rain"} <= set(peps_envs.names())
+    for name, task in TASKS.items():
+        assert task.default_belief == "biased"
+        assert set(task.beliefs) == {"biased", "unbiased", "reward", "both"}
+        friction = lambda params: (float(params.physics.friction.mean), float(params.physics.friction.sd))
+        assert friction(task.beliefs["biased"]) == friction(TASKS["dry"].params)
+        chex.assert_trees_all_equal(task.beliefs["unbiased"], task.params)
+        assert task.beliefs["reward"].ratings.distance > task.params.ratings.distance
+        assert friction(task.beliefs["reward"]) == friction(TASKS[name].params)
+
+
+def test_an_unknown_number_is_refused():
+    with pytest.raises(ValueError, match=r"^highway parameter 'frction_mean': known are friction_mean, "):
+        highway.make_params(frction_mean=0.5)
+
+
+def test_batches_of_states_and_of_beliefs():
+    beliefs = jax.tree.map(lambda *leaves: jnp.stack(leaves), TASKS["rain"].params, TASKS["dry"].params)
+    keys = jax.random.split(jax.random.key(0), 2)
+    traced = jax.jit(chex.assert_max_traces(lambda key, params: episodes(key[None], jnp.array(BRAKE), params)[0], 1))
+    batched = jax.jit(jax.vmap(traced))(keys, beliefs)
+    for index, name in enumerate(("rain", "dry")):
+        single = episodes(keys[index][None], jnp.array(BRAKE), TASKS[name].params)[0]
+        np.testing.assert_allclose(batched[index], single, rtol=1e-4)
+
+
+def test_traffic_in_the_other_lane():
+    world = highway.Highway(traffic=2, changes=True)
+    params = TASKS["rain"].params
+    state, observation = jax.jit(world.reset)(jax.random.key(0), params)
+    assert observation.shape == (world.observation_size,) == (18,)
+    np.testing.assert_array_equal(state.vehicles.y, [4, 4, 0, 0])
+    assert state.vehicles.x[2] < state.vehicles.x[0] < state.vehicles.x[3]
+    step = jax.jit(world.step)
+    for number in range(8):
+        after = step(jax.random.key(number), state, jnp.int32(SLOWER), params)
+        state = after.state
+        assert np.all(np.isfinite(after.observation))
+    assert bool(after.truncated | after.terminated)
+    assert not np.any(state.vehicles.crashed[2:])
+
+
+def test_highway_envs_own_observation_and_reward():
+    world, params = highway.ClassicHighway(), highway.make_params()
+    state, observation = jax.jit(world.reset)(jax.random.key(0), params)
+    assert observation.shape == (world.observation_size,)
+    np.testing.assert_allclose(world.perceive_observation(observation, params), world.perceive(state), atol=1e-3)
+    after = jax.jit(world.step)(jax.random.key(0), state, jnp.int32(FASTER), params)
+    assert after.reward == pytest.approx((0.4 * min((after.state.vehicles.speed[0] - 20) / 10, 1) + 0.1 + 1) / 1.5)
