@@ -5,7 +5,7 @@ BIN := .venv/bin
 READY := .venv/ready
 ARGS ?=
 
-.PHONY: sweep test verify-navigation benchmark lint lock setup
+.PHONY: sweep test verify-navigation benchmark benchmark-highway lint lock setup
 .DEFAULT_GOAL := sweep
 
 sweep: $(READY)
@@ -19,6 +19,9 @@ verify-navigation: $(READY)
 
 benchmark: $(READY)
 	$(BIN)/python benchmarks/speed.py $(ARGS)
+
+benchmark-highway: $(READY)
+	$(BIN)/python benchmarks/highway.py $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -156,7 +156,7 @@ class Highway(Environment):
         return EGO_FEATURES + OTHER_FEATURES * (1 + self.traffic)
 
     def reset(self, key: Array, params: HighwayParams) -> tuple[HighwayState, Array]:
-        key_speed, key_gap, key_deceleration, key_onset, key_spacing, key_timer = jax.random.split(key, 6)
+        key_speed, key_gap, key_deceleration, key_onset, key_spacing, key_wait = jax.random.split(key, 6)
         scenario, number = params.scenario, 2 + self.traffic
         draw = lambda key, limits, shape=(): jax.random.uniform(key, shape, minval=limits[0], maxval=limits[1])
         speed = draw(key_speed, scenario.speed)
@@ -166,7 +166,9 @@ class Highway(Environment):
         lane = jnp.where(jnp.arange(number) < 2, self.lanes - 1, self.lanes - 2).astype(jnp.int32)
         zeros, never = jnp.zeros(number, speed.dtype), jnp.zeros(number, bool)
         steered = jnp.arange(number) != 1
-        delay = traffic.steps_until(0.0, self.road.dt)
+        wait = jnp.zeros(number, jnp.int32)
+        if self.traffic:
+            wait = jax.random.randint(key_wait, (number,), 0, traffic.steps_until(0.0, self.road.dt) + 1)
         vehicles = Vehicles(
             x=jnp.concatenate([jnp.stack([jnp.full_like(ahead, START), ahead]), others]),
             y=LANE_WIDTH * lane.astype(speed.dtype),
@@ -176,7 +178,7 @@ class Highway(Environment):
             speed_rest=zeros,
             target_lane=lane,
             target_speed=jnp.where(steered, speed, 0.0),
-            wait=jax.random.randint(key_timer, (number,), 0, delay + 1),
+            wait=wait,
             impact_x=zeros,
             impact_y=zeros,
             struck=never,
