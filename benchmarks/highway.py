@@ -72,7 +72,7 @@ def ours(name: str, batch: int, steps: int, devices: int) -> tuple[float, float]
 
 def theirs(seconds: float) -> float | None:
     """Policy steps a second of highway-env on one core; None where it can't be had, which one line explains."""
-    home = FOLDER / ".venvs/highway"
+    home = FOLDER.parent / "build/highway-env"
     python = home / "bin/python"
     try:
         if not (home / "ready").exists():
