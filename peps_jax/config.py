@@ -18,7 +18,7 @@ import peps_envs
 from peps_envs.registry import unknown_name
 
 STRATEGIES = ("information_gain", "disagreement", "random")
-LEVELS = ("none", "quantile", "max")
+LEVELS = ("none", "quantile", "max", "standard")
 
 
 def _static(default: Any, text: str, **metadata: Any) -> Any:
