@@ -257,7 +257,7 @@ def test_a_loaded_cell_acts_and_scores_as_it_did(swept, tiny):
     again = peps_jax.load(str(swept), "nav-d1-peps-lam2.4-seed4")
     third = peps_jax.load(swept, {"method": "peps", "lam": 2.4, "seed": 4})
     for other in (again, third):
-        jax.tree.map(np.testing.assert_array_equal, result.agent, other.agent)
+        jax.tree.map(np.testing.assert_array_equal, result.agents, other.agents)
     assert result.act(jnp.zeros(tiny.task()[0].observation_size)).shape == (2,)
     evaluation = jax.jit(peps_jax.evaluate, static_argnums=2)(result, result.config, EPISODES)
     np.testing.assert_allclose(evaluation.return_.mean(), float(row["return_mean"]), rtol=1e-4)
@@ -331,7 +331,7 @@ def test_a_cell_alone_in_a_split_batch_and_beside_a_failing_one(line, train):
     for name, curve in alone.curves.items():
         np.testing.assert_allclose(finished[2].result.curves[name], curve, rtol=1e-3, atol=1e-4, err_msg=name)
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
-    jax.tree.map(close, finished[2].result.agent.policy, alone.agent.policy)
+    jax.tree.map(close, finished[2].result.agents[0].policy, alone.agents[0].policy)
 
 
 def test_a_failed_cell_is_a_row_that_says_so(tiny):
