@@ -68,7 +68,7 @@ def init(config: Config) -> TrainingState:
     environment, _, _ = config.task()
     method = methods.get(config.method)
     return TrainingState(
-        agents=tuple(sac.init(key, config) for key in _agent_keys(key_agent, len(method.rewards))),
+        agents=tuple(sac.init(key, config) for key in _keys(key_agent, len(method.rewards))),
         knowledge=method.init(key_knowledge, config),
         replay=replay.init(config.num_rounds * config.steps_per_round, environment),
         actors=rollout.init(key_actors, config),
@@ -83,9 +83,16 @@ def collect_and_ask(
     key_act, key_ask, _, _, _ = _round_keys(state, index)
     key_act, key_hold = jax.random.split(key_act)
     parts, _, _ = sac.networks(config)
+    env = jnp.arange(config.num_envs)
+    # Where several policies act together, each acts alone too, in environments of its own: SAC goes astray with a policy
+    # whose actions it never sees carried out.
+    alone = [(agent,) for agent in state.agents]
+    teams = alone if len(alone) == 1 else [state.agents, *alone]
 
     def act(observation: Array, key: Array, time: Array) -> Array:
-        action, _ = sac.act(state.agents, observation, key, config)
+        keys = _keys(key, len(teams))
+        actions = [sac.act(team, observation, key, config)[0] for team, key in zip(teams, keys, strict=True)]
+        action = jnp.stack(actions, 1)[env, env % len(teams)]
         # A random action is held: a walk that turns at every step hardly leaves the start. Some are taken to the very end:
         # what the policy has abandoned would otherwise never be seen, asked about and valued again.
         key_uniform, key_explore = jax.random.split(jax.random.fold_in(key_hold, time // config.hold_steps))
@@ -129,9 +136,7 @@ def improve(
         return sac.update(agent, batch, temperature, key, config)
 
     agents, infos = [], []
-    for agent, reward, key in zip(
-        state.agents, method.rewards, _agent_keys(key_update, len(method.rewards)), strict=True
-    ):
+    for agent, reward, key in zip(state.agents, method.rewards, _keys(key_update, len(method.rewards)), strict=True):
         # all at once: what the method knows doesn't change within a round
         valued = batches._replace(reward=reward(state.knowledge, batches, config) * config.reward_scale)
         agent, info = jax.lax.scan(update, agent, (valued, jax.random.split(key, config.updates_per_round)))
@@ -181,9 +186,9 @@ def finish(state: TrainingState, curves: dict[str, Array], config: Config) -> Re
     return Result(agents=state.agents, knowledge=state.knowledge, curves=curves, config=config)
 
 
-def _agent_keys(key: Array, number: int) -> list[Array]:
-    """A key for each agent. The first one's is `key` itself: a second agent doesn't change the first one's numbers."""
-    return [key, *(jax.random.fold_in(key, agent) for agent in range(1, number))]
+def _keys(key: Array, number: int) -> list[Array]:
+    """A key for each of `number` agents. The first one's is `key` itself: others don't change its numbers."""
+    return [key, *(jax.random.fold_in(key, other) for other in range(1, number))]
 
 
 def _round_keys(state: TrainingState, index: Array) -> Array:

@@ -12,6 +12,7 @@ from peps_envs import Discrete
 from peps_jax import Config, methods
 from peps_jax.methods import drlhp
 from peps_jax.parts import sac
+from peps_jax.train import collect_and_ask, init
 
 EVERY = ("peps", "sac", "drlhp", "policy_shaping", "human")
 EPISODES = 6
@@ -154,6 +155,22 @@ def test_policy_shaping_acts_by_the_product(line, train):
     observation = jnp.array([0.3])
     outputs = jnp.stack([network.apply(agent.policy, observation) for agent in result.agents])
     np.testing.assert_allclose(result.act(observation), head.mode(head.product(outputs)), rtol=1e-6)
+
+
+def test_the_product_and_each_policy_act_in_environments_of_their_own(line):
+    line = line.replace(method="policy_shaping", warmup_steps=0, exploration=0.0)
+    state = init(line)
+    agents = []
+    for agent, push in zip(state.agents, (5.0, -5.0), strict=True):
+        policy = jax.tree.map(jnp.zeros_like, agent.policy)
+        policy["params"]["Dense_1"]["bias"] = jnp.array([push, -0.5])
+        agents.append(agent.replace(policy=policy))
+    state = state.replace(agents=tuple(agents))
+    state, _, _ = jax.jit(collect_and_ask)(state, jnp.asarray(0), line)
+    by_env = state.replay.action[: line.steps_per_round].reshape(-1, line.num_envs)
+    assert bool(jnp.all(by_env[:, 1] > 0.9))
+    assert bool(jnp.all(by_env[:, 2] < -0.9))
+    assert abs(float(jnp.mean(by_env[:, [0, 3]]))) < 0.3, "the two cancel"
 
 
 def test_the_human_lives_in_the_believed_world(line, train, evaluate):

@@ -3,7 +3,10 @@
     pi(a|s) ~ pi_A(a|s) pi_H(a|s),
 
 normalised over discrete actions; for continuous ones it is the product of the Gaussians before tanh, whose mean is weighed by
-their precisions. Feedback is PEPS's r-hat, from the same teacher and budget, so that the two differ in what they make of it.
+their precisions. Feedback is PEPS's r-hat, from the same teacher and budget: the two differ in what they make of it. While they
+learn, the product acts in a third of the environments and each policy alone in another third (`train.collect_and_ask`): where
+only the product acted, the policies' own mistakes were never carried out, and so never corrected.
+
 Two policies that are sure of opposite actions make one that is sure of neither: (0.1, 0.9) and (0.9, 0.1) give (0.5, 0.5).
 """
 
