@@ -326,7 +326,7 @@ class Program:
         for place, cell in enumerate(cells):
             own = jax.tree.map(lambda values: values[place], (results, evaluations, curves))  # noqa: B023, used at once
             result = own[0].replace(curves=own[2], config=cell)
-            finished.append(Finished(result, own[1], failed=not _finite((own[0].agent, own[0].knowledge, own[1]))))
+            finished.append(Finished(result, own[1], failed=not _finite((own[0].agents, own[0].knowledge, own[1]))))
         return finished, times
 
 

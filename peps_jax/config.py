@@ -18,7 +18,7 @@ import peps_envs
 from peps_envs.registry import unknown_name
 
 STRATEGIES = ("information_gain", "disagreement", "random")
-LEVELS = ("none", "quantile", "max")
+LEVELS = ("none", "quantile", "max", "standard")
 
 
 def _static(default: Any, text: str, **metadata: Any) -> Any:
@@ -38,7 +38,9 @@ class Config:
     """
 
     env: Any = _static("nav-d1", "the world", group="task")
-    method: str = _static("peps", "what is learned, and the reward that SAC sees: peps or sac", group="task")
+    method: str = _static(
+        "peps", "what is learned, and from which reward: peps, sac, drlhp, policy_shaping or human", group="task"
+    )
     seed: Any = _traced(0, "random seed", group="task")
     params: Any = _traced(None, "true parameters of the world (default: the task's)", group="task", flag=False)
     belief: Any = _traced(None, "what the human believes (default: the task's first belief)", group="task")

@@ -11,7 +11,7 @@ from flax import struct
 from jax import Array
 
 import peps_envs
-from peps_jax import explicability
+from peps_jax import explicability, methods
 from peps_jax.config import Config
 from peps_jax.explicability import Score
 from peps_jax.train import Result
@@ -78,12 +78,12 @@ def evaluate(
 
     Args:
       result: of `train`.
-      config: world, belief and seed to evaluate in; usually the training's.
+      config: world, method, belief and seed to evaluate in; usually the training's. "human" acts in the believed world.
       num_episodes: how many.
       stochastic: act by samples instead of the policy's mode.
       key: random key; by default one that follows from `config.seed` and differs from the training's.
     """
-    environment, params, belief = config.task()
+    environment, params, belief = methods.task(config)
     key = jax.random.fold_in(jax.random.key(config.seed), 1) if key is None else key
     return evaluate_policy(result.policy(), environment, params, belief, key, num_episodes, stochastic=stochastic)
 

@@ -318,17 +318,17 @@ def _rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def surrogate_maps(rows: Sequence[Row]) -> Figure | None:
-    """r_hat as a heat map beside the true l_H + r_H, for the first seed of each world that learned one."""
+    """r_hat as a heat map beside the true l_H + r_H, for the first seed of each world and method that learned one."""
     rows = [row for row in _good(rows) if _navigates(row) and hasattr(row.finished.result.knowledge, "surrogate")]
     if not rows:
         return None
     lam = _middle_lam(rows)
-    first: dict[str, Row] = {}
+    first: dict[tuple[str, str], Row] = {}
     for row in rows:
         if row.cell.lam == lam:
-            first.setdefault(row.cell.env, row)
+            first.setdefault((row.cell.env, row.cell.method), row)
     figure, panels = _figure(len(first), 2, 3.3, 2.75)
-    for line, (env, row) in enumerate(first.items()):
+    for line, ((env, method), row) in enumerate(first.items()):
         learned, true, free = surrogate_values(row.finished.result)
         params = row.finished.result.config.task()[1]
         agreement = _rank_correlation(learned[free], true[free])
@@ -336,7 +336,7 @@ def surrogate_maps(rows: Sequence[Row]) -> Figure | None:
         for axes, values, title in zip(panels[line], (learned, true), titles, strict=True):
             _heat(figure, axes, np.where(free, values, np.nan), params)
             axes.set_title(title, color=INK, fontsize=9)
-        panels[line, 0].set_ylabel(f"{env}, seed {row.cell.seed}", color=INK, fontsize=10)
+        panels[line, 0].set_ylabel(f"{env}, {method}, seed {row.cell.seed}", color=INK, fontsize=9)
     return figure
 
 

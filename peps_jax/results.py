@@ -191,7 +191,7 @@ def _learned(result: Result) -> bytes:
     """What a training leaves; the world's numbers too, so that it is evaluated in the world it was trained in."""
     _, params, belief = result.config.task()
     parts = {
-        "agent": result.agent,
+        "agents": result.agents,
         "knowledge": result.knowledge,
         "curves": result.curves,
         "params": params,
@@ -244,7 +244,7 @@ def load(folder: str | os.PathLike[str], cell: int | str | Mapping[str, Any]) ->
     config = _config(configuration, entry)
     _, params, belief = config.task()
     shapes = jax.eval_shape(init, config)
-    empty = {"agent": shapes.agent, "knowledge": shapes.knowledge, "params": params, "belief": belief}
+    empty = {"agents": shapes.agents, "knowledge": shapes.knowledge, "params": params, "belief": belief}
     path = folder / entry["file"]
     try:
         stored = flax.serialization.msgpack_restore(path.read_bytes())
@@ -256,7 +256,7 @@ def load(folder: str | os.PathLike[str], cell: int | str | Mapping[str, Any]) ->
         reason = str(error).splitlines()[0]
         raise ValueError(f"file {str(path)!r} was written by a version that doesn't fit this one: {reason}") from None
     config = config.replace(params=parts["params"], belief=parts["belief"])
-    return Result(agent=parts["agent"], knowledge=parts["knowledge"], curves=curves, config=config)
+    return Result(agents=parts["agents"], knowledge=parts["knowledge"], curves=curves, config=config)
 
 
 def _find(cells: Sequence[Mapping[str, Any]], wanted: int | str | Mapping[str, Any]) -> Mapping[str, Any]:

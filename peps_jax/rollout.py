@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from peps_jax import explicability
+from peps_jax import explicability, methods
 from peps_jax.config import Config
 from peps_jax.explicability import Score
 from peps_jax.parts.trajectory import Trajectory, Transition
@@ -34,7 +34,7 @@ class Actors:
 
 def init(key: Array, config: Config) -> Actors:
     """All environments at their start."""
-    environment, params, _ = config.task()
+    environment, params, _ = methods.task(config)
     state, observation = jax.vmap(environment.reset, in_axes=(0, None))(jax.random.split(key, config.num_envs), params)
     zeros = jnp.zeros(config.num_envs)
     return Actors(state=state, observation=observation, running=Running(Score(zeros, zeros, zeros, zeros), zeros))
@@ -53,7 +53,7 @@ def collect(
       trajectory: all transitions, each with its own last observation, never the next episode's first.
       info: means over the episodes that ended in this round (nan if none did), and their number.
     """
-    environment, params, belief = config.task()
+    environment, params, belief = methods.task(config)
     reset = jax.vmap(environment.reset, in_axes=(0, None))
     step = jax.vmap(environment.step, in_axes=(0, 0, 0, None))
 

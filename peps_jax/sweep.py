@@ -43,7 +43,7 @@ devices, and writes tables, curves, learned parameters and pictures into a folde
 Without flags: a demonstration of a few minutes."""
 
 EPILOG = """\
-A method that doesn't use lambda (sac) is trained once for each world and seed; its row is
+A method that doesn't use lambda (any but peps) is trained once for each world and seed; its row is
 repeated for every lambda, so that the table holds the whole grid.
 
 examples:

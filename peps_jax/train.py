@@ -25,8 +25,8 @@ from peps_jax.parts.trajectory import Preferences, Segments, Transition
 class TrainingState:
     """All of a training between two rounds, random key included."""
 
-    agent: sac.Agent
-    knowledge: Any  # what the method learns beside the policy
+    agents: tuple[sac.Agent, ...]  # one for each of the method's rewards; they act together
+    knowledge: Any  # what the method learns beside the policies
     replay: Transition
     actors: rollout.Actors
     key: Array
@@ -36,7 +36,7 @@ class TrainingState:
 class Result:
     """A finished training, ready to act."""
 
-    agent: sac.Agent
+    agents: tuple[sac.Agent, ...]
     knowledge: Any
     curves: dict[str, Array]  # (rounds,) each
     config: Config
@@ -50,8 +50,8 @@ class Result:
 
         def policy(observation: Array, key: Array | None) -> tuple[Array, Array]:
             if key is None:
-                return sac.mode(self.agent, observation, self.config)
-            return sac.act(self.agent, observation, key, self.config)
+                return sac.mode(self.agents, observation, self.config)
+            return sac.act(self.agents, observation, key, self.config)
 
         return policy
 
@@ -66,9 +66,10 @@ def init(config: Config) -> TrainingState:
     """The state before the first round."""
     key_agent, key_knowledge, key_actors, key = jax.random.split(jax.random.key(config.seed), 4)
     environment, _, _ = config.task()
+    method = methods.get(config.method)
     return TrainingState(
-        agent=sac.init(key_agent, config),
-        knowledge=methods.get(config.method).init(key_knowledge, config),
+        agents=tuple(sac.init(key, config) for key in _keys(key_agent, len(method.rewards))),
+        knowledge=method.init(key_knowledge, config),
         replay=replay.init(config.num_rounds * config.steps_per_round, environment),
         actors=rollout.init(key_actors, config),
         key=key,
@@ -81,10 +82,17 @@ def collect_and_ask(
     """The first half of round `index`: act, remember, and choose what to ask. Queries are None from a method that asks nothing."""
     key_act, key_ask, _, _, _ = _round_keys(state, index)
     key_act, key_hold = jax.random.split(key_act)
-    parts, policy_network, _ = sac.networks(config)
+    parts, _, _ = sac.networks(config)
+    env = jnp.arange(config.num_envs)
+    # Where several policies act together, each acts alone too, in environments of its own: SAC goes astray with a policy
+    # whose actions it never sees carried out.
+    alone = [(agent,) for agent in state.agents]
+    teams = alone if len(alone) == 1 else [state.agents, *alone]
 
     def act(observation: Array, key: Array, time: Array) -> Array:
-        action, _ = parts.sample(policy_network.apply(state.agent.policy, observation), key)
+        keys = _keys(key, len(teams))
+        actions = [sac.act(team, observation, key, config)[0] for team, key in zip(teams, keys, strict=True)]
+        action = jnp.stack(actions, 1)[env, env % len(teams)]
         # A random action is held: a walk that turns at every step hardly leaves the start. Some are taken to the very end:
         # what the policy has abandoned would otherwise never be seen, asked about and valued again.
         key_uniform, key_explore = jax.random.split(jax.random.fold_in(key_hold, time // config.hold_steps))
@@ -109,26 +117,32 @@ def learn_and_improve(
         state.knowledge, state.replay, filled, preferences, index, key_learn, config
     )
     state = state.replace(knowledge=knowledge)
-    agent, improved = improve(state, index, key_improve, config)
-    return state.replace(agent=agent), learned | improved
+    agents, improved = improve(state, index, key_improve, config)
+    return state.replace(agents=agents), learned | improved
 
 
-def improve(state: TrainingState, index: Array, key: Array, config: Config) -> tuple[sac.Agent, dict[str, Array]]:
-    """SAC updates of one round, on minibatches whose reward is the method's, by what it knows now."""
+def improve(
+    state: TrainingState, index: Array, key: Array, config: Config
+) -> tuple[tuple[sac.Agent, ...], dict[str, Array]]:
+    """SAC updates of one round: every agent sees the same minibatches, with its own reward by what the method knows now."""
     method = methods.get(config.method)
     key_batch, key_update = jax.random.split(key)
     filled = (index + 1) * config.steps_per_round
     batches = replay.sample(state.replay, key_batch, (config.updates_per_round, config.batch_size), filled)
-    # all at once: what the method knows doesn't change within a round
-    batches = batches._replace(reward=method.reward(state.knowledge, batches, config) * config.reward_scale)
     temperature = (annealed_temperature(index, config) + method.entropy_weight(config)) * config.reward_scale
 
     def update(agent: sac.Agent, step: tuple[Transition, Array]) -> tuple[sac.Agent, dict[str, Array]]:
         batch, key = step
         return sac.update(agent, batch, temperature, key, config)
 
-    agent, info = jax.lax.scan(update, state.agent, (batches, jax.random.split(key_update, config.updates_per_round)))
-    return agent, jax.tree.map(jnp.mean, info)
+    agents, infos = [], []
+    for agent, reward, key in zip(state.agents, method.rewards, _keys(key_update, len(method.rewards)), strict=True):
+        # all at once: what the method knows doesn't change within a round
+        valued = batches._replace(reward=reward(state.knowledge, batches, config) * config.reward_scale)
+        agent, info = jax.lax.scan(update, agent, (valued, jax.random.split(key, config.updates_per_round)))
+        agents.append(agent)
+        infos.append(info)
+    return tuple(agents), jax.tree.map(lambda *values: jnp.mean(jnp.stack(values)), *infos)
 
 
 def annealed_temperature(index: Array, config: Config) -> Array:
@@ -169,7 +183,12 @@ def train(config: Config, teacher: human.Teacher = human.SYNTHETIC) -> Result:
 
 def finish(state: TrainingState, curves: dict[str, Array], config: Config) -> Result:
     """What remains of a training when its rounds are done."""
-    return Result(agent=state.agent, knowledge=state.knowledge, curves=curves, config=config)
+    return Result(agents=state.agents, knowledge=state.knowledge, curves=curves, config=config)
+
+
+def _keys(key: Array, number: int) -> list[Array]:
+    """A key for each of `number` agents. The first one's is `key` itself: others don't change its numbers."""
+    return [key, *(jax.random.fold_in(key, other) for other in range(1, number))]
 
 
 def _round_keys(state: TrainingState, index: Array) -> Array:

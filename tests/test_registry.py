@@ -134,7 +134,7 @@ def test_a_task_of_ones_own_trains(registered, tiny, train):
     result = train(tiny.replace(env="railway", belief=Rail(speed=0.4)))
     assert result.curves["return_"].shape == (tiny.num_rounds,)
     assert {"arrived", "surrogate_loss"} <= set(result.curves)
-    for leaf in jax.tree.leaves((result.agent, result.knowledge)):
+    for leaf in jax.tree.leaves((result.agents, result.knowledge)):
         if jnp.issubdtype(leaf.dtype, jnp.floating):
             assert np.all(np.isfinite(leaf))
     action = result.act(jnp.zeros(1))

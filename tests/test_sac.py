@@ -158,7 +158,7 @@ def probe(line, environment, temperature=0.0, **params):
 def values(result, observation, action):
     """Both critics' Q, for rows of observations and actions."""
     head, _, network = sac.networks(result.config)
-    return head.critics(network, result.agent.critics, jnp.asarray(observation), jnp.asarray(action))
+    return head.critics(network, result.agents[0].critics, jnp.asarray(observation), jnp.asarray(action))
 
 
 def test_probe_constant_reward(line, train):
@@ -192,7 +192,7 @@ def test_probe_discrete_actions_and_the_soft_policy(line, train):
     quality = np.array([0.0, 0.5, 1.0]) * gap
     np.testing.assert_allclose(values(result, jnp.zeros((3, 1)), jnp.arange(3)), [quality] * 2, atol=0.1)
     _, network, _ = sac.networks(result.config)
-    probabilities = jax.nn.softmax(network.apply(result.agent.policy, jnp.zeros(1)))
+    probabilities = jax.nn.softmax(network.apply(result.agents[0].policy, jnp.zeros(1)))
     expected = np.exp(quality / temperature) / np.exp(quality / temperature).sum()  # pi ~ exp(Q / alpha)
     np.testing.assert_allclose(probabilities, expected, atol=0.06)
     assert int(result.act(jnp.zeros(1))) == 2

@@ -1,5 +1,6 @@
 """r-hat: the Bradley-Terry fit, its resamples, and its level."""
 
+import functools
 import math
 
 import jax
@@ -48,11 +49,11 @@ def visited(key, number=512):
     return Transition(observation, action, zeros, observation, zeros)
 
 
-@jax.jit
-def taught(preferences, config):
+@functools.partial(jax.jit, static_argnames="recipe")
+def taught(preferences, config, recipe=surrogate.PLAIN):
     key_init, key_add, key_fit, key_visited = jax.random.split(jax.random.key(7), 4)
     state = surrogate.add(surrogate.init(key_init, config), preferences, 0, key_add, config)
-    return surrogate.fit(state, visited(key_visited), NUMBER, 512, key_fit, config)
+    return surrogate.fit(state, visited(key_visited), NUMBER, 512, key_fit, config, recipe)
 
 
 def queries_of(segments, config):
@@ -158,8 +159,70 @@ def test_level_is_pinned_over_replay(config, level):
     seen = visited(jax.random.split(jax.random.key(7), 4)[3])  # what `taught` has in replay
     learned = np.asarray(surrogate.predict(state, seen.observation, seen.action, config))
     if level == "none":
-        assert (float(state.shift), float(state.scale)) == (0.0, 1.0)
+        assert set(np.asarray(state.shift)) == {0.0}
+        assert set(np.asarray(state.scale)) == {1.0}
     if level == "max":
         np.testing.assert_allclose(learned.max(), 0.0, atol=5e-2 * np.ptp(learned))
     if level == "quantile":
         np.testing.assert_allclose(np.quantile(learned, [0.05, 0.95]), [-1.0, 0.0], atol=0.15)
+
+
+def test_the_level_standard_normalises_every_member(config):
+    segments = random_segments(jax.random.key(1), config)
+    preferences = answered(jax.random.key(2), segments, segments.observation[..., 0])
+    state, _ = taught(preferences, config.replace(surrogate_updates=5), surrogate.Recipe(level="standard"))
+    seen = visited(jax.random.key(7), number=4096)
+    raw = surrogate.member_rewards(state, seen.observation, seen.action, config)
+    np.testing.assert_allclose(raw.mean(-1), state.shift, atol=0.15 * float(state.scale.max()))
+    np.testing.assert_allclose(raw.std(-1), state.scale, rtol=0.15)
+    learned = surrogate.predict(state, seen.observation, seen.action, config)
+    by_hand = np.mean((raw - np.asarray(state.shift)[:, None]) / np.asarray(state.scale)[:, None], 0)
+    np.testing.assert_allclose(learned, by_hand, rtol=1e-4, atol=1e-5)
+
+
+def test_uniform_answers_bound_the_likelihood(config):
+    recipe = surrogate.Recipe(uniform_answers=0.1)
+    difference = jnp.array([-200.0, -1.0, 0.0, 1.0, 200.0])
+    logits = surrogate.answer_logits(difference, recipe)
+    expected = 0.05 + 0.9 / (1 + np.exp(-np.asarray(difference, np.float64)))
+    np.testing.assert_allclose(jax.nn.sigmoid(logits), expected, rtol=1e-4)
+    slope = jax.vmap(jax.grad(lambda value: surrogate.answer_logits(value, recipe)))(difference)
+    assert bool(jnp.all(jnp.isfinite(slope)))
+    np.testing.assert_array_equal(surrogate.answer_logits(difference, surrogate.PLAIN), difference)
+
+    state = surrogate.init(jax.random.key(0), config)
+    features, mask = queries_of(random_segments(jax.random.key(1), config, 6), config)
+    sure = jax.tree.map(lambda leaf: 1e3 * leaf, state.params)
+    arguments = (sure, features, mask, jnp.zeros(6), jnp.ones((6, config.ensemble_size)), config)
+    assert float(surrogate.loss(*arguments)[0]) > -math.log(0.05)
+    assert float(surrogate.loss(*arguments, recipe)[0]) <= -math.log(0.05) + 1e-5, "an error costs at most this"
+
+
+def test_what_a_resample_leaves_out_is_a_share_of_1_over_e(config):
+    segments = random_segments(jax.random.key(1), config)
+    state = surrogate.init(jax.random.key(0), config)
+    state = surrogate.add(
+        state, Preferences(segments, jnp.ones(NUMBER), jnp.ones(NUMBER)), 0, jax.random.key(2), config
+    )
+    assert abs(float(jnp.mean(state.weights == 0)) - math.exp(-1)) < 0.05
+
+
+@pytest.mark.parametrize(("noisy", "grows"), [(True, True), (False, False)])
+def test_weight_decay_follows_the_validation_loss(config, noisy, grows):
+    """Up where members learn random answers by heart, down where what they learn holds for all."""
+    segments = random_segments(jax.random.key(1), config)
+    preferences = answered(jax.random.key(2), segments, 5 * segments.observation[..., 0])
+    if noisy:
+        coins = jax.random.bernoulli(jax.random.key(3), shape=(NUMBER,)).astype(jnp.float32)
+        few = (jnp.arange(NUMBER) < 60).astype(jnp.float32)
+        preferences = preferences._replace(answers=coins, answered=few)
+    config = config.replace(surrogate_decay=1e-2, surrogate_learning_rate=3e-2 if noisy else 1e-3)
+    state, info = taught(preferences, config, surrogate.Recipe(validates=True))
+    ratio = float(info["surrogate_validation_ratio"])
+    low, high = surrogate.VALIDATION_RATIO
+    assert ratio > high if grows else ratio < low
+    factor = surrogate.DECAY_STEP if grows else 1 / surrogate.DECAY_STEP
+    np.testing.assert_allclose([state.decay, info["surrogate_decay"]], 1e-2 * factor, rtol=1e-5)
+    plain, _ = taught(preferences, config)
+    np.testing.assert_allclose(plain.decay, 1e-2, rtol=1e-6)
+    jax.tree.map(lambda one, two: np.testing.assert_allclose(one, two, rtol=1e-4), plain.params, state.params)

@@ -14,7 +14,8 @@ import pytest
 
 import peps_envs
 import peps_jax
-from peps_jax import batch, results, sweep
+from peps_jax import batch, plots, results, sweep
+from peps_jax.train import finish, init
 
 PREFIX = "python -m peps_jax.sweep: error: "
 EPISODES = 4
@@ -257,12 +258,47 @@ def test_a_loaded_cell_acts_and_scores_as_it_did(swept, tiny):
     again = peps_jax.load(str(swept), "nav-d1-peps-lam2.4-seed4")
     third = peps_jax.load(swept, {"method": "peps", "lam": 2.4, "seed": 4})
     for other in (again, third):
-        jax.tree.map(np.testing.assert_array_equal, result.agent, other.agent)
+        jax.tree.map(np.testing.assert_array_equal, result.agents, other.agents)
     assert result.act(jnp.zeros(tiny.task()[0].observation_size)).shape == (2,)
     evaluation = jax.jit(peps_jax.evaluate, static_argnums=2)(result, result.config, EPISODES)
     np.testing.assert_allclose(evaluation.return_.mean(), float(row["return_mean"]), rtol=1e-4)
     np.testing.assert_allclose(evaluation.explicability.mean(), float(row["explicability_mean"]), rtol=1e-4)
     assert result.curves["preference_accuracy"].shape == (4,)
+
+
+@pytest.fixture
+def line_task(line, monkeypatch):
+    """The line as an environment that command lines know."""
+    beliefs = {"noisy": line.belief, "true": line.params}
+    monkeypatch.setitem(peps_envs.registry._TASKS, "line", lambda: peps_envs.Task(line.env, line.params, beliefs))
+
+
+@pytest.mark.slow
+def test_every_method_is_swept_and_loaded(line, line_task, tmp_path):
+    names = ("drlhp", "policy_shaping", "human")
+    flags = ["--env", "line", "--method", *names, "--lam", "1.0", "2.4", "--seeds", "1"]
+    assert call([*flags, *tiny_flags(line), "--out", str(tmp_path)]) == 0
+    rows = table(tmp_path)
+    assert [(row["method"], row["status"]) for row in rows] == [(name, "ok") for name in names for _ in range(2)]
+    assert len(list((tmp_path / results.CELLS).iterdir())) == 3, "none of them uses lambda"
+    curves = np.load(tmp_path / results.CURVES)
+    assert np.isfinite(curves["surrogate_decay"][:2]).all()
+    assert np.isnan(curves["surrogate_decay"][2:]).all(), "only drlhp adapts its weight decay"
+    for name, agents in zip(names, (1, 2, 1), strict=True):
+        result = peps_jax.load(tmp_path, {"method": name, "lam": 2.4})
+        assert len(result.agents) == agents
+        assert result.act(jnp.zeros(1)).shape == (1,)
+
+
+@pytest.mark.slow
+def test_every_method_with_a_surrogate_reward_has_its_heat_map(tiny):
+    rows = []
+    for method in ("peps", "sac", "drlhp"):
+        config = tiny.replace(method=method)
+        finished = batch.Finished(finish(jax.jit(init)(config), {}, config), evaluation=None, failed=False)
+        rows += [results.Row(results.Cell("nav-d1", method, 2.4, seed, "any"), finished) for seed in (0, 1)]
+    titles = [axes.get_ylabel() for axes in plots.surrogate_maps(rows).axes]
+    assert [title for title in titles if title.startswith("nav")] == ["nav-d1, peps, seed 0", "nav-d1, drlhp, seed 0"]
 
 
 @pytest.mark.parametrize(
@@ -286,9 +322,7 @@ def test_a_folder_without_results_is_said(tmp_path):
         peps_jax.load(tmp_path, 0)
 
 
-def test_an_interrupted_sweep_keeps_what_is_finished(line, tmp_path, capsys, monkeypatch):
-    beliefs = {"noisy": line.belief, "true": line.params}
-    monkeypatch.setitem(peps_envs.registry._TASKS, "line", lambda: peps_envs.Task(line.env, line.params, beliefs))
+def test_an_interrupted_sweep_keeps_what_is_finished(line, line_task, tmp_path, capsys, monkeypatch):
     for name in (results.TABLE, results.PICTURES[0]):
         (tmp_path / name).write_text("an earlier run's")
     (tmp_path / "notes.txt").write_text("mine")
@@ -331,7 +365,7 @@ def test_a_cell_alone_in_a_split_batch_and_beside_a_failing_one(line, train):
     for name, curve in alone.curves.items():
         np.testing.assert_allclose(finished[2].result.curves[name], curve, rtol=1e-3, atol=1e-4, err_msg=name)
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
-    jax.tree.map(close, finished[2].result.agent.policy, alone.agent.policy)
+    jax.tree.map(close, finished[2].result.agents[0].policy, alone.agents[0].policy)
 
 
 def test_a_failed_cell_is_a_row_that_says_so(tiny):

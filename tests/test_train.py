@@ -68,20 +68,20 @@ def test_curves_have_a_point_for_every_round(line, train):
 
 
 def test_the_same_seed_gives_the_same_numbers_and_another_does_not(line, train):
-    chex.assert_trees_all_equal(train(line).agent, train(line).agent)
-    other = train(line.replace(seed=1)).agent
-    assert not np.allclose(jax.tree.leaves(other.policy)[1], jax.tree.leaves(train(line).agent.policy)[1])
+    chex.assert_trees_all_equal(train(line).agents, train(line).agents)
+    other = train(line.replace(seed=1)).agents[0]
+    assert not np.allclose(jax.tree.leaves(other.policy)[1], jax.tree.leaves(train(line).agents[0].policy)[1])
 
 
 def test_peps_at_lam_0_is_sac(line, train):
     peps, sac = train(line.replace(lam=0.0)), train(line.replace(method="sac"))
-    assert_close(peps.agent, sac.agent)
+    assert_close(peps.agents, sac.agents)
     for name in sac.curves:
         np.testing.assert_allclose(peps.curves[name], sac.curves[name], rtol=1e-4, atol=1e-5, err_msg=name)
 
 
 def test_lam_changes_what_peps_learns(line, train):
-    still, moved = train(line.replace(lam=0.0)).agent.critics, train(line.replace(lam=2.4)).agent.critics
+    still, moved = train(line.replace(lam=0.0)).agents[0].critics, train(line.replace(lam=2.4)).agents[0].critics
     differences = jax.tree.map(lambda one, two: float(jnp.max(jnp.abs(one - two))), still, moved)
     assert max(jax.tree.leaves(differences)) > 1e-3
 
@@ -103,7 +103,7 @@ def test_a_vmapped_cell_matches_its_single_run(line, train, train_three):
     batch = train_three(cells)
     for cell in range(3):
         single = train(cell_of(cells, cell))
-        assert_close(cell_of(batch.agent, cell), single.agent, rtol=1e-2, atol=1e-3)
+        assert_close(cell_of(batch.agents, cell), single.agents, rtol=1e-2, atol=1e-3)
         for name in ("return_", "explicability", "surrogate_loss", "critic_loss"):
             np.testing.assert_allclose(
                 batch.curves[name][cell], single.curves[name], rtol=1e-2, atol=1e-3, err_msg=name
@@ -120,7 +120,7 @@ def test_other_leaves_compile_nothing(line, train_three):
 def test_a_vmapped_cell_matches_its_single_run_in_a_navigation_domain(tiny, train):
     cells = grid(tiny.replace(method="sac"), seed=[0, 1], temperature=[1.0, 0.5])
     batch = jax.jit(jax.vmap(peps_jax.train))(cells)
-    assert_close(cell_of(batch.agent, 1), train(cell_of(cells, 1)).agent, rtol=1e-2, atol=1e-3)
+    assert_close(cell_of(batch.agents, 1), train(cell_of(cells, 1)).agents, rtol=1e-2, atol=1e-3)
 
 
 def test_inside_somebody_elses_scan(line, train):

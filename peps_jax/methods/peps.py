@@ -7,9 +7,10 @@ from flax import struct
 from jax import Array
 
 from peps_jax.config import Config
-from peps_jax.methods.method import Method
-from peps_jax.parts import dynamics, queries, surrogate
-from peps_jax.parts.trajectory import Preferences, Segments, Trajectory, Transition
+from peps_jax.methods import feedback
+from peps_jax.methods.method import Method, true_world
+from peps_jax.parts import dynamics, surrogate
+from peps_jax.parts.trajectory import Preferences, Transition
 
 
 @struct.dataclass
@@ -25,15 +26,6 @@ def init(key: Array, config: Config) -> Knowledge:
     return Knowledge(dynamics=dynamics.init(key_dynamics, config), surrogate=surrogate.init(key_surrogate, config))
 
 
-def ask(knowledge: Knowledge, trajectory: Trajectory, key: Array, config: Config) -> Segments:
-    """The queries of this round: of the latest trajectories' pairs, those from which the ensemble learns most."""
-    key_candidates, key_choose = jax.random.split(key)
-    pairs = queries.candidates(trajectory, key_candidates, config)
-    logits = surrogate.preference_logits(knowledge.surrogate, pairs, config)
-    chosen = queries.choose(logits, queries.describe(pairs), key_choose, config)
-    return jax.tree.map(lambda rows: rows[chosen], pairs)
-
-
 def learn(
     knowledge: Knowledge,
     buffer: Transition,
@@ -44,12 +36,11 @@ def learn(
     config: Config,
 ) -> tuple[Knowledge, dict[str, Array]]:
     """Lines 4-8 of Algorithm 1: T_A from replay, r_hat from the preferences given so far."""
-    key_dynamics, key_add, key_surrogate = jax.random.split(key, 3)
+    key_dynamics, *keys = jax.random.split(key, 3)
     dynamics_state, dynamics_info = dynamics.fit(knowledge.dynamics, buffer, filled, key_dynamics, config)
-    position = index * config.queries_per_round
-    taught = surrogate.add(knowledge.surrogate, preferences, position, key_add, config)
-    known = position + config.queries_per_round
-    surrogate_state, surrogate_info = surrogate.fit(taught, buffer, known, filled, key_surrogate, config)
+    surrogate_state, surrogate_info = feedback.learn(
+        knowledge.surrogate, buffer, filled, preferences, index, tuple(keys), config
+    )
     return Knowledge(dynamics=dynamics_state, surrogate=surrogate_state), dynamics_info | surrogate_info
 
 
@@ -65,10 +56,11 @@ def reward(knowledge: Knowledge, transitions: Transition, config: Config) -> Arr
 PEPS = Method(
     name="peps",
     uses_lam=True,
+    world=true_world,
     init=init,
-    ask=ask,
+    ask=lambda knowledge, trajectory, key, config: feedback.ask(knowledge.surrogate, trajectory, key, config),
     learn=learn,
-    reward=reward,
+    rewards=(reward,),
     # SAC's own temperature explores; Eq. (6)'s comes on top, so that at lambda = 0 PEPS is SAC
     entropy_weight=lambda config: config.lam * config.policy_entropy_weight,
 )

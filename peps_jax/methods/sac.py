@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from peps_jax.methods.method import Method
+from peps_jax.methods.method import Method, true_world
 
 SAC = Method(
     name="sac",
     uses_lam=False,
+    world=true_world,
     init=lambda key, config: (),
     ask=lambda knowledge, trajectory, key, config: None,
     learn=lambda knowledge, buffer, filled, preferences, index, key, config: (knowledge, {}),
-    reward=lambda knowledge, transitions, config: transitions.reward,
+    rewards=(lambda knowledge, transitions, config: transitions.reward,),
     entropy_weight=lambda config: 0.0,
 )

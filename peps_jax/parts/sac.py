@@ -51,6 +51,7 @@ class Head(NamedTuple):
     sample: Callable[[Array, Array], tuple[Array, Array]]  # (outputs, key) -> action, l_pi
     mode: Callable[[Array], Array]  # outputs -> action
     log_ratio: Callable[[Array, Array], Array]  # (outputs, action) -> l_pi
+    product: Callable[[Array], Array]  # outputs of several policies, stacked -> those of their normalised product
     uniform: Callable[[Array], Array]  # key -> action
     critics: Callable[[Any, Any, Array, Array], Array]  # (network, params, observation, action) -> (critics, ...)
     penalty: Callable[[Array], Array]  # outputs -> what keeps the policy where gradients reach it, at least 0
@@ -58,10 +59,15 @@ class Head(NamedTuple):
     expect: Callable[[Array, Array, Any, Any, Array], tuple[Array, Array]]
 
 
+def _gaussian(outputs: Array) -> tuple[Array, Array]:
+    """Mean and log standard deviation before tanh, from outputs (..., 2n)."""
+    mean, log_sd = jnp.split(outputs, 2, axis=-1)
+    return mean, MIN_LOG_SD + 0.5 * (MAX_LOG_SD - MIN_LOG_SD) * (jnp.tanh(log_sd) + 1)
+
+
 def squashed_gaussian(outputs: Array) -> distrax.Distribution:
     """tanh of a Gaussian: actions in (-1, 1)^n from outputs (..., 2n)."""
-    mean, log_sd = jnp.split(outputs, 2, axis=-1)
-    log_sd = MIN_LOG_SD + 0.5 * (MAX_LOG_SD - MIN_LOG_SD) * (jnp.tanh(log_sd) + 1)
+    mean, log_sd = _gaussian(outputs)
     return distrax.Transformed(distrax.MultivariateNormalDiag(mean, jnp.exp(log_sd)), distrax.Block(distrax.Tanh(), 1))
 
 
@@ -85,6 +91,17 @@ def continuous_head(observation_size: int, action_size: int) -> Head:
         action, ratio = sample(outputs, key)
         return jnp.min(critics(network, params, observation, action), 0), ratio
 
+    def product(outputs: Array) -> Array:
+        # of the Gaussians before tanh: the product of squashed densities would count tanh's Jacobian once for each
+        mean, log_sd = _gaussian(outputs)
+        precision = jnp.exp(-2 * log_sd)
+        total = jnp.sum(precision, 0)
+        share = (-0.5 * jnp.log(total) - MIN_LOG_SD) / (MAX_LOG_SD - MIN_LOG_SD)  # of the way between a head's bounds
+        limit = 1 - 1e-6  # the inverse of tanh is infinite at 1
+        return jnp.concatenate(
+            [jnp.sum(precision * mean, 0) / total, jnp.arctanh(jnp.clip(2 * share - 1, -limit, limit))], -1
+        )
+
     return Head(
         policy_size=2 * action_size,
         critic_inputs=observation_size + action_size,
@@ -92,6 +109,7 @@ def continuous_head(observation_size: int, action_size: int) -> Head:
         sample=sample,
         mode=lambda outputs: jnp.tanh(jnp.split(outputs, 2, axis=-1)[0]),
         log_ratio=log_ratio,
+        product=product,
         uniform=lambda key: jax.random.uniform(key, (action_size,), minval=-1.0, maxval=1.0),
         critics=critics,
         # where tanh is flat no gradient turns an action back: a policy that leans against a wall would stay there
@@ -128,6 +146,7 @@ def discrete_head(observation_size: int, num_actions: int) -> Head:
         sample=sample,
         mode=lambda outputs: jnp.argmax(outputs, -1),
         log_ratio=log_ratio,
+        product=lambda outputs: jnp.sum(jax.nn.log_softmax(outputs), 0),
         uniform=lambda key: jax.random.randint(key, (), 0, num_actions),
         critics=critics,
         penalty=lambda outputs: jnp.zeros(()),
@@ -172,16 +191,23 @@ def init(key: Array, config: Config) -> Agent:
     )
 
 
-def act(agent: Agent, observation: Array, key: Array, config: Config) -> tuple[Array, Array]:
-    """A sampled action and l_pi(a|s), for one observation."""
+def acting_outputs(agents: tuple[Agent, ...], observation: Array, config: Config) -> Array:
+    """Outputs of the acting policy: the only agent's own, or those of the normalised product of several agents' policies."""
     parts, policy_network, _ = networks(config)
-    return parts.sample(policy_network.apply(agent.policy, observation), key)
+    outputs = [policy_network.apply(agent.policy, observation) for agent in agents]
+    return outputs[0] if len(agents) == 1 else parts.product(jnp.stack(outputs))
 
 
-def mode(agent: Agent, observation: Array, config: Config) -> tuple[Array, Array]:
-    """The policy's most likely action before squashing, and l_pi(a|s), for one observation."""
-    parts, policy_network, _ = networks(config)
-    outputs = policy_network.apply(agent.policy, observation)
+def act(agents: tuple[Agent, ...], observation: Array, key: Array, config: Config) -> tuple[Array, Array]:
+    """An action sampled from the acting policy, and l_pi(a|s)."""
+    parts, _, _ = networks(config)
+    return parts.sample(acting_outputs(agents, observation, config), key)
+
+
+def mode(agents: tuple[Agent, ...], observation: Array, config: Config) -> tuple[Array, Array]:
+    """The acting policy's most likely action before squashing, and l_pi(a|s)."""
+    parts, _, _ = networks(config)
+    outputs = acting_outputs(agents, observation, config)
     action = parts.mode(outputs)
     return action, parts.log_ratio(outputs, action)
 

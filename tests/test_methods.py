@@ -1,0 +1,206 @@
+"""The methods: what each learns from, in which world, and how its policies act together."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import LineParams, Probe, ProbeParams
+
+import peps_jax
+from peps_envs import Discrete
+from peps_jax import Config, methods
+from peps_jax.methods import drlhp
+from peps_jax.parts import sac
+from peps_jax.train import collect_and_ask, init
+
+EVERY = ("peps", "sac", "drlhp", "policy_shaping", "human")
+EPISODES = 6
+
+
+@pytest.fixture(scope="module")
+def evaluate():
+    return jax.jit(peps_jax.evaluate, static_argnames=("num_episodes", "stochastic"))
+
+
+def test_the_methods_and_their_order():
+    assert tuple(methods.METHODS) == EVERY
+    text = Config.__dataclass_fields__["method"].metadata["help"]
+    places = [text.index(name) for name in ("peps", " sac", "drlhp", "policy_shaping", "human")]
+    assert places == sorted(places)
+    assert [name for name in EVERY if methods.get(name).uses_lam] == ["peps"]
+
+
+# --- the product of policies ----------------------------------------------------------------------------------------------
+
+
+def test_opposed_discrete_policies_make_one_that_is_sure_of_nothing():
+    """(0.1, 0.9) x (0.9, 0.1) -> (0.5, 0.5)  (the paper, Sec. 5.1)."""
+    head = sac.discrete_head(1, 2)
+    product = lambda *policies: jax.nn.softmax(head.product(jnp.log(jnp.array(policies)) + 3.0))  # logits have no level
+    np.testing.assert_allclose(product((0.1, 0.9), (0.9, 0.1)), [0.5, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(product((0.1, 0.9), (0.5, 0.5)), [0.1, 0.9], rtol=1e-6)
+    np.testing.assert_allclose(product((0.2, 0.8), (0.4, 0.6)), [0.08 / 0.56, 0.48 / 0.56], rtol=1e-5)
+
+
+def raw(sd):
+    """The policy network's output that stands for a standard deviation."""
+    share = (np.log(sd) - sac.MIN_LOG_SD) / (sac.MAX_LOG_SD - sac.MIN_LOG_SD)
+    return np.arctanh(2 * share - 1)
+
+
+def gaussian(outputs):
+    """Mean and standard deviation before tanh."""
+    density = sac.squashed_gaussian(jnp.asarray(outputs, jnp.float32)).distribution
+    return np.asarray(density.loc), np.asarray(density.scale_diag)
+
+
+def test_continuous_policies_are_weighed_by_their_precision():
+    head = sac.continuous_head(1, 2)
+    outputs = jnp.array([[1.0, -2.0, raw(0.5), raw(0.3)], [-1.0, 1.0, raw(1.0), raw(0.3)]], jnp.float32)
+    mean, sd = gaussian(head.product(outputs))
+    precision = np.array([[4.0, 1 / 0.09], [1.0, 1 / 0.09]])
+    np.testing.assert_allclose(sd, precision.sum(0) ** -0.5, rtol=1e-4)
+    np.testing.assert_allclose(mean, [(4.0 - 1.0) / 5.0, -0.5], rtol=1e-4)
+
+
+def test_the_product_is_that_of_the_densities_before_tanh():
+    head = sac.continuous_head(1, 1)
+    outputs = jnp.array([[0.7, raw(0.6)], [-0.4, raw(0.9)]], jnp.float32)
+    places = np.linspace(-6, 6, 4001)
+    density = lambda mean, sd: np.exp(-0.5 * ((places - mean) / sd) ** 2) / sd
+    product = density(0.7, 0.6) * density(-0.4, 0.9)
+    product /= np.trapezoid(product, places)
+    mean, sd = gaussian(head.product(outputs))
+    expected = density(mean[0], sd[0]) / np.sqrt(2 * np.pi)
+    np.testing.assert_allclose(expected, product, atol=1e-4)
+
+
+def test_products_at_the_bounds_are_finite():
+    head = sac.continuous_head(1, 1)
+    for extreme in (-50.0, 50.0):
+        outputs = jnp.array([[3.0, extreme], [-3.0, extreme]])
+        product, gradient = head.product(outputs), jax.jacobian(head.product)(outputs)
+        assert bool(jnp.all(jnp.isfinite(product)))
+        assert bool(jnp.all(jnp.isfinite(gradient)))
+        np.testing.assert_allclose(product[0], 0.0, atol=1e-6)
+        _, sd = gaussian(product)
+        assert np.exp(sac.MIN_LOG_SD) * 0.99 <= sd[0] <= np.exp(sac.MAX_LOG_SD)
+
+
+@pytest.mark.parametrize("space", ["continuous", "discrete"])
+def test_one_agent_acts_by_itself_and_two_by_their_product(line, space):
+    if space == "discrete":
+        line = line.replace(env=Probe(action_space=Discrete(3)), params=ProbeParams(), belief=ProbeParams())
+    parts, network, _ = sac.networks(line)
+    agents = tuple(sac.init(jax.random.key(seed), line) for seed in range(2))
+    observations = jnp.linspace(-1.0, 1.0, 5)[:, None]
+    each = jnp.stack([network.apply(agent.policy, observations) for agent in agents])
+    np.testing.assert_array_equal(sac.acting_outputs(agents[:1], observations, line), each[0])
+    together = sac.acting_outputs(agents, observations, line)
+    np.testing.assert_allclose(together, jax.vmap(parts.product, in_axes=1)(each), rtol=1e-5, atol=1e-6)
+    action, ratio = sac.mode(agents, observations, line)
+    np.testing.assert_array_equal(action, parts.mode(together))
+    np.testing.assert_allclose(ratio, parts.log_ratio(together, action), rtol=1e-6)
+    sampled, ratio = sac.act(agents, observations, jax.random.key(0), line)
+    np.testing.assert_allclose(ratio, parts.log_ratio(together, sampled), rtol=1e-2, atol=1e-3)
+
+
+# --- what each learns -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", EVERY)
+def test_every_method_learns_and_acts(line, train, evaluate, method):
+    result = train(line.replace(method=method))
+    assert len(result.agents) == (2 if method == "policy_shaping" else 1)
+    chex.assert_tree_all_finite((result.agents, result.knowledge))
+    assert result.act(jnp.zeros(1)).shape == (1,)
+    asks = method in ("peps", "drlhp", "policy_shaping")
+    assert hasattr(result.knowledge, "surrogate") == asks
+    assert ("surrogate_loss" in result.curves) == asks
+    assert ("dynamics_loss" in result.curves) == (method == "peps")
+    if asks:
+        assert int(result.knowledge.surrogate.answered.sum()) == line.num_queries
+    evaluation = evaluate(result, result.config, num_episodes=EPISODES)
+    assert evaluation.explicability.shape == (EPISODES,)
+    assert bool(jnp.all(jnp.isfinite(evaluation.explicability)))
+
+
+@pytest.mark.parametrize("method", ["sac", "drlhp", "policy_shaping", "human"])
+def test_lam_changes_nothing_of_a_method_without_it(line, train, method):
+    one, two = (train(line.replace(method=method, lam=lam)).agents for lam in (0.5, 2.4))
+    chex.assert_trees_all_equal(one, two)
+
+
+def test_drlhp_does_not_see_the_environments_reward(line, train):
+    line = line.replace(method="drlhp")
+    one, two = (train(line.replace(params=LineParams(slope=slope))) for slope in (1.0, -5.0))
+    chex.assert_trees_all_equal(one.agents, two.agents)
+    other = train(line.replace(belief=LineParams(noise=0.1, slope=-5.0)))
+    assert not np.allclose(other.knowledge.surrogate.answers, one.knowledge.surrogate.answers)
+
+
+def test_policy_shaping_learns_one_policy_of_each_reward(line, train):
+    line = line.replace(method="policy_shaping", exploration=1.0)  # all actions are random: the same data for both
+    one, two = (train(line.replace(params=LineParams(slope=slope))).agents for slope in (1.0, -5.0))
+    chex.assert_trees_all_equal(one[1], two[1])
+    assert not np.allclose(jax.tree.leaves(one[0].critics)[0], jax.tree.leaves(two[0].critics)[0])
+    alone = train(line.replace(method="sac", params=LineParams(slope=1.0))).agents[0]
+    chex.assert_trees_all_close(one[0], alone, rtol=1e-4, atol=1e-5)
+
+
+def test_policy_shaping_acts_by_the_product(line, train):
+    result = train(line.replace(method="policy_shaping"))
+    head, network, _ = sac.networks(result.config)
+    observation = jnp.array([0.3])
+    outputs = jnp.stack([network.apply(agent.policy, observation) for agent in result.agents])
+    np.testing.assert_allclose(result.act(observation), head.mode(head.product(outputs)), rtol=1e-6)
+
+
+def test_the_product_and_each_policy_act_in_environments_of_their_own(line):
+    line = line.replace(method="policy_shaping", warmup_steps=0, exploration=0.0)
+    state = init(line)
+    agents = []
+    for agent, push in zip(state.agents, (5.0, -5.0), strict=True):
+        policy = jax.tree.map(jnp.zeros_like, agent.policy)
+        policy["params"]["Dense_1"]["bias"] = jnp.array([push, -0.5])
+        agents.append(agent.replace(policy=policy))
+    state = state.replace(agents=tuple(agents))
+    state, _, _ = jax.jit(collect_and_ask)(state, jnp.asarray(0), line)
+    by_env = state.replay.action[: line.steps_per_round].reshape(-1, line.num_envs)
+    assert bool(jnp.all(by_env[:, 1] > 0.9))
+    assert bool(jnp.all(by_env[:, 2] < -0.9))
+    assert abs(float(jnp.mean(by_env[:, [0, 3]]))) < 0.3, "the two cancel"
+
+
+def test_the_human_lives_in_the_believed_world(line, train, evaluate):
+    belief = LineParams(noise=0.05, slope=-2.0)
+    line = line.replace(method="human", belief=belief)
+    result = train(line)
+    ended = np.asarray(result.curves["episodes"]) > 0
+    for name in ("human_return", "explicability"):
+        np.testing.assert_allclose(result.curves[name][ended], result.curves["return_"][ended], rtol=1e-5)
+    imagined = evaluate(result, line, num_episodes=EPISODES, stochastic=True)
+    np.testing.assert_allclose(imagined.belief_gap, 0.0, atol=1e-5)
+    np.testing.assert_allclose(imagined.explicability, imagined.return_, rtol=1e-5)
+    # what happened is the belief: its noise, and its reward
+    places = imagined.perceived[..., 0]
+    np.testing.assert_allclose(imagined.return_[0], -2.0 * places[0, 1 : 1 + int(imagined.length[0])].sum(), rtol=1e-4)
+    true = evaluate(result, line.replace(method="sac"), num_episodes=EPISODES)
+    np.testing.assert_allclose(true.human_return, -2.0 * true.return_, rtol=1e-4)
+
+
+def test_the_human_of_a_true_belief_is_sac(line, train):
+    line = line.replace(belief=line.params)
+    human, sac_ = train(line.replace(method="human")), train(line.replace(method="sac"))
+    chex.assert_trees_all_close(human.agents, sac_.agents, rtol=1e-4, atol=1e-5)
+
+
+def test_drlhp_normalises_every_member(line, train):
+    result = train(line.replace(method="drlhp"))
+    state, config = result.knowledge.surrogate, result.config
+    assert drlhp.RECIPE.level == "standard"
+    assert state.shift.shape == state.scale.shape == (config.ensemble_size,)
+    assert len(set(np.asarray(state.scale).tolist())) == config.ensemble_size
+    assert "surrogate_validation_ratio" in result.curves
+    assert not np.allclose(state.decay, config.surrogate_decay)
