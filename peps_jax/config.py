@@ -52,7 +52,7 @@ class Config:
     policy_entropy_weight: Any = _traced(0.4, "weight of the policy entropy in Eq. (6)", group="objective")
     gamma: Any = _traced(0.995, "discount", group="objective")
 
-    total_steps: int = _static(30_000, "environment steps in all", group="run")
+    total_steps: int = _static(40_000, "environment steps in all", group="run")
     num_envs: int = _static(16, "environments side by side", group="run")
     rollout_length: int = _static(25, "steps that each environment makes in a round", group="run")
     warmup_steps: int = _static(3_200, "environment steps with uniformly random actions at the start", group="run")
@@ -60,12 +60,13 @@ class Config:
     hold_steps: int = _static(5, "steps for which such an action is held", group="run")
 
     learning_rate: Any = _traced(1e-3, "Adam's rate for policy and critics", group="sac")
+    fade_share: Any = _traced(0.3, "share of the rounds, at the end, over which that rate falls to a tenth", group="sac")
     temperature: Any = _traced(
-        0.05, "weight of the policy entropy beside Eq. (6)'s, at the end (in reward units)", group="sac"
+        0.02, "weight of the policy entropy beside Eq. (6)'s, at the end (in reward units)", group="sac"
     )
-    initial_temperature: Any = _traced(1.0, "the same at the start: exploration fades", group="sac")
-    anneal_share: Any = _traced(0.6, "share of the rounds over which the temperature fades", group="sac")
-    saturation_penalty: Any = _traced(0.05, "price of a squared action before tanh (in reward units)", group="sac")
+    initial_temperature: Any = _traced(3.0, "the same at the start: exploration fades", group="sac")
+    anneal_share: Any = _traced(0.8, "share of the rounds over which the temperature fades", group="sac")
+    saturation_penalty: Any = _traced(0.02, "price of a squared action before tanh (in reward units)", group="sac")
     tune_temperature: bool = _static(False, "tune the temperature to a target entropy instead", group="sac")
     target_rate: Any = _traced(0.01, "share of the critics that the targets take over at an update", group="sac")
     reward_scale: Any = _traced(0.1, "what rewards are multiplied by before the critics see them", group="sac")
@@ -79,15 +80,15 @@ class Config:
     )
     dynamics_learning_rate: Any = _traced(1e-3, "Adam's rate for the dynamics", group="models")
     dynamics_updates: int = _static(20, "gradient steps on the dynamics in a round", group="models")
-    surrogate_learning_rate: Any = _traced(4e-3, "Adam's rate for the surrogate reward", group="models")
-    surrogate_updates: int = _static(50, "gradient steps on the surrogate reward in a round", group="models")
+    surrogate_learning_rate: Any = _traced(5e-3, "Adam's rate for the surrogate reward", group="models")
+    surrogate_updates: int = _static(40, "gradient steps on the surrogate reward in a round", group="models")
     surrogate_batch_size: int = _static(64, "preferences in a minibatch of the surrogate's fit", group="models")
     surrogate_decay: Any = _traced(1e-4, "weight decay of the surrogate's fit", group="models")
     level: str = _static(
         "none", f"what pins the surrogate reward's level after the fit: {', '.join(LEVELS)}", group="models"
     )
 
-    num_queries: int = _static(1_500, "preferences that the teacher gives in all", group="queries")
+    num_queries: int = _static(3_000, "preferences that the teacher gives in all", group="queries")
     segment_length: int = _static(5, "steps of the longest segment", group="queries")
     min_segment_length: int = _static(
         2, "steps of the shortest segment (unequal lengths pin the level)", group="queries"

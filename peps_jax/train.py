@@ -131,9 +131,11 @@ def improve(
     batches = replay.sample(state.replay, key_batch, (config.updates_per_round, config.batch_size), filled)
     temperature = (annealed_temperature(index, config) + method.entropy_weight(config)) * config.reward_scale
 
+    slower = config.replace(learning_rate=faded_learning_rate(index, config))
+
     def update(agent: sac.Agent, step: tuple[Transition, Array]) -> tuple[sac.Agent, dict[str, Array]]:
         batch, key = step
-        return sac.update(agent, batch, temperature, key, config)
+        return sac.update(agent, batch, temperature, key, slower)
 
     agents, infos = [], []
     for agent, reward, key in zip(state.agents, method.rewards, _keys(key_update, len(method.rewards)), strict=True):
@@ -150,6 +152,15 @@ def annealed_temperature(index: Array, config: Config) -> Array:
     done = jnp.clip(index / jnp.maximum(config.anneal_share * config.num_rounds, 1.0), 0.0, 1.0)
     first, last = jnp.maximum(config.initial_temperature, 1e-6), jnp.maximum(config.temperature, 1e-6)
     return jnp.exp((1 - done) * jnp.log(first) + done * jnp.log(last))
+
+
+def faded_learning_rate(index: Array, config: Config) -> Array:
+    """SAC's learning rate in round `index`: whole at first, then falling linearly to a tenth at the end.
+
+    Late in a training a full step trades one of two nearly equal ways for the other.
+    """
+    left = 1 - index / config.num_rounds
+    return config.learning_rate * jnp.clip(left / jnp.maximum(config.fade_share, 1e-6), 0.1, 1.0)
 
 
 def run_round(

@@ -300,10 +300,10 @@ _CROSSING = dict(
 # Where things stand in the paper's Figure 2, and what is true there. Reaching the goal past the pit takes 6 steps in D1 and in
 # D2, the detour that a human expects 7; the ice takes 11 in D3 and D4, the sand 12 in D4.
 DOMAINS = {
-    "d1": dict(start=(0.75, 0.5), pit=(2.0, 0.0, 4.0, 0.7)),
-    "d2": dict(start=(0.75, 0.5), pit=(2.0, 0.4, 4.0, 1.1)),
+    "d1": dict(start=(0.5, 0.5), pit=(2.0, 0.0, 4.0, 1.0)),
+    "d2": dict(start=(0.5, 0.5), pit=(2.0, 0.3, 4.0, 1.0)),
     "d3": _CROSSING | dict(sand_gain=0.1, sand_stuck=0.5),
-    "d4": _CROSSING | dict(sand_gain=0.75),
+    "d4": _CROSSING | dict(sand_gain=0.8),
 }
 
 # What the human thinks instead: unsteady near the pit, slipping on ice and slow there, moving readily on sand.
