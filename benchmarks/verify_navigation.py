@@ -9,6 +9,7 @@ episodes with the policy's mode, and the same with samples beside it.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import pathlib
@@ -25,7 +26,7 @@ from scipy import stats
 import peps_envs
 from peps_envs.navigation import NavigationState
 from peps_jax import Config, batch, evaluate, planner
-from peps_jax.evaluate import evaluate_policy
+from peps_jax.evaluate import Evaluation, evaluate_policy
 from peps_jax.parts import human, surrogate
 from peps_jax.train import finish, init, run_rounds
 
@@ -40,18 +41,18 @@ LAMBDAS = (0.0, 0.5, 1.0, 2.0, 2.4, 2.8)
 FOLDER = pathlib.Path(__file__).parent / "results"
 
 
-def route(domain: str, places: np.ndarray) -> str:
-    """Names the way that `places` (steps + 1, 2) take through a domain.
+def route(domain: str, places: np.ndarray, arrived: bool = True) -> str:
+    """Names the way that `places` (steps + 1, 2) take through a domain: "none" if it didn't arrive.
 
     D1: "detour" if, past the pit, its clearance is above 0.6 on average. D2: below or above the pit. D3, D4: on which side of
     the diagonal the way keeps its largest distance.
     """
+    if not arrived:
+        return "none"
     x, y = places.T
     if domain in ("nav-d1", "nav-d2"):
         pit = np.asarray(peps_envs.make(domain).params.pit)
         past = y[(x > pit[0]) & (x < pit[2])]
-        if past.size == 0 or x[-1] < pit[2]:
-            return "none"
         if domain == "nav-d1":
             return "detour" if past.mean() - pit[3] > 0.6 else "along the pit"
         return "below" if past.mean() > pit[1] else "corridor"
@@ -102,27 +103,25 @@ def interval(values: np.ndarray) -> tuple[float, float]:
     return tuple(np.percentile(draws, [2.5, 97.5]))
 
 
-def bounds(domain: str, lam: float) -> dict[str, tuple[float, float, str]]:
-    """The exact planner's return, explicability and route for both objectives."""
+@functools.partial(jax.jit, static_argnames=("environment", "objective"))
+def planned_episodes(environment, params, belief, lam, objective: str) -> Evaluation:
+    """Episodes of the exact planner."""
+    plan = planner.solve(params, belief, objective, lam)
+    return evaluate_policy(plan.policy, environment, params, belief, jax.random.key(0), 20)
+
+
+def bound(domain: str, lam: float, objective: str) -> tuple[float, float, str]:
+    """The exact planner's return, explicability and route."""
     task = peps_envs.make(domain)
-    belief = task.beliefs[task.default_belief]
-
-    def solved(objective: str) -> tuple[float, float, str]:
-        def run(params, belief):
-            plan = planner.solve(params, belief, objective, lam)
-            return evaluate_policy(plan.policy, task.environment, params, belief, jax.random.key(0), 20)
-
-        episodes = jax.jit(run)(task.params, belief)
-        places = np.asarray(episodes.perceived[0])
-        return float(episodes.return_.mean()), float(episodes.explicability.mean()), route(domain, places)
-
-    return {objective: solved(objective) for objective in ("return", "peps")}
+    episodes = planned_episodes(task.environment, task.params, task.beliefs[task.default_belief], lam, objective)
+    way = route(domain, np.asarray(episodes.perceived[0]), bool(episodes.goal_reached[0]))
+    return float(episodes.return_.mean()), float(episodes.explicability.mean()), way
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--seeds", type=int, default=8, help="trainings per domain and method")
-    parser.add_argument("--lam-seeds", type=int, default=2, help="trainings per domain and lambda")
+    parser.add_argument("--lam-seeds", type=int, default=4, help="trainings per domain and lambda")
     parser.add_argument("--steps", type=int, default=Config().total_steps, help="environment steps of a training")
     arguments = parser.parse_args()
     base = Config(total_steps=arguments.steps)
@@ -130,7 +129,10 @@ def main() -> None:
     lines, record = [], {"seeds": arguments.seeds, "steps": arguments.steps, "domains": {}}
 
     print("planner", flush=True)
-    planned = {domain: bounds(domain, float(base.lam)) for domain in DOMAINS}
+    planned = {
+        domain: {objective: bound(domain, float(base.lam), objective) for objective in ("return", "peps")}
+        for domain in DOMAINS
+    }
     measured = {}
     for method in ("sac", "peps"):
         print(method, flush=True)
@@ -150,7 +152,7 @@ def main() -> None:
             lines.append(f"| {domain} | planner, {objective} | {value:.1f} | {explicability:.1f} | | | {way} |")
             figures = {name: values[rows] for name, values in measured[method].items()}
             low, high = interval(figures["explicability"])
-            ways = [route(domain, places) for places in figures["places"]]
+            ways = [route(domain, *way) for way in zip(figures["places"], figures["goal"] > 0.5, strict=True)]
             right = ways.count(ROUTES[domain][0 if method == "peps" else 1])
             lines.append(
                 f"| {domain} | {method} | {figures['return'].mean():.1f} | {figures['explicability'].mean():.1f} "
@@ -191,9 +193,13 @@ def main() -> None:
         lines += ["", "| explicability at lambda | " + " | ".join(map(str, LAMBDAS)) + " | Spearman |"]
         lines += ["|---" * (len(LAMBDAS) + 2) + "|"]
         for domain, values in zip(domains, by_lam, strict=True):
-            spearman = float(stats.spearmanr(LAMBDAS, values)[0])
-            record["domains"][domain]["lam"] = {"explicability": values.tolist(), "spearman": spearman}
-            lines.append(f"| {domain} | " + " | ".join(f"{value:.1f}" for value in values) + f" | {spearman:.2f} |")
+            exact = [bound(domain, lam, "peps")[1] for lam in LAMBDAS]
+            record["domains"][domain]["lam"] = {}
+            for who, row in (("planner", exact), ("peps", values.tolist())):
+                spearman = float(stats.spearmanr(LAMBDAS, row)[0])
+                record["domains"][domain]["lam"][who] = {"explicability": row, "spearman": spearman}
+                cells = " | ".join(f"{value:.1f}" for value in row)
+                lines.append(f"| {domain}, {who} | {cells} | {spearman:.2f} |")
 
     FOLDER.mkdir(exist_ok=True)
     (FOLDER / "navigation.md").write_text("\n".join(lines) + "\n")

@@ -49,7 +49,7 @@ class Config:
     lam: Any = _traced(2.4, "reconciliation parameter: weight of explicability against return", group="objective")
     surrogate_weight: Any = _traced(1.0, "weight of the surrogate reward in Eq. (6)", group="objective")
     environment_entropy_weight: Any = _traced(1.0, "weight of the environment entropy in Eq. (6)", group="objective")
-    policy_entropy_weight: Any = _traced(0.4, "weight of the policy entropy in Eq. (6)", group="objective")
+    policy_entropy_weight: Any = _traced(0.3, "weight of the policy entropy in Eq. (6)", group="objective")
     gamma: Any = _traced(0.995, "discount", group="objective")
 
     total_steps: int = _static(40_000, "environment steps in all", group="run")
@@ -60,7 +60,9 @@ class Config:
     hold_steps: int = _static(5, "steps for which such an action is held", group="run")
 
     learning_rate: Any = _traced(1e-3, "Adam's rate for policy and critics", group="sac")
-    fade_share: Any = _traced(0.3, "share of the rounds, at the end, over which that rate falls to a tenth", group="sac")
+    fade_share: Any = _traced(
+        0.3, "share of the rounds, at the end, over which that rate falls to a tenth", group="sac"
+    )
     temperature: Any = _traced(
         0.02, "weight of the policy entropy beside Eq. (6)'s, at the end (in reward units)", group="sac"
     )
