@@ -5,7 +5,7 @@ BIN := .venv/bin
 READY := .venv/ready
 ARGS ?=
 
-.PHONY: sweep test verify-navigation benchmark benchmark-highway lint lock setup
+.PHONY: sweep test verify-navigation benchmark benchmark-highway readme lint lock setup
 .DEFAULT_GOAL := sweep
 
 sweep: $(READY)
@@ -22,6 +22,9 @@ benchmark: $(READY)
 
 benchmark-highway: $(READY)
 	$(BIN)/python benchmarks/highway.py $(ARGS)
+
+readme: $(READY)
+	$(BIN)/python benchmarks/readme.py
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -3,7 +3,7 @@
     make benchmark [ARGS="--cells 4 --steps 12000"]
 
 16 environments, one SAC update per 4 steps, batch 256. SAC at two widths of two layers, and PEPS with its default models;
-PEPS's rate is also given as a share of SAC's in the same run.
+PEPS's rate is also given as a share of SAC's in the same run, and its time and memory for growing numbers of seeds.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import argparse
 import os
 import pathlib
 import time
+from typing import NamedTuple
 
 os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={len(os.sched_getaffinity(0))}")
 
@@ -24,8 +25,17 @@ from peps_jax import Config, grid, train
 FOLDER = pathlib.Path(__file__).parent / "results"
 
 
-def rate(config: Config, cells: int) -> tuple[float, float]:
-    """Environment steps a second summed over cells, and the compilation's seconds."""
+class Cost(NamedTuple):
+    """What a batch of trainings took."""
+
+    seconds: float
+    rate: float  # environment steps a second, summed over cells
+    compilation: float  # s
+    memory: float  # MB on all devices: arguments, results and what the program works with, as XLA reports them
+
+
+def cost(config: Config, cells: int) -> Cost:
+    """Trains `cells` seeds."""
     mesh, spec = jax.make_mesh((jax.device_count(),), ("cells",)), PartitionSpec("cells")
     batch = jax.device_put(grid(config, seed=np.arange(cells)), NamedSharding(mesh, spec))
     body = lambda batch: jax.lax.map(train, batch)
@@ -36,12 +46,17 @@ def rate(config: Config, cells: int) -> tuple[float, float]:
     compiled = time.perf_counter()
     jax.block_until_ready(program(batch))
     seconds = time.perf_counter() - compiled
-    return cells * config.num_rounds * config.steps_per_round / seconds, compiled - start
+    steps = cells * config.num_rounds * config.steps_per_round
+    used = program.memory_analysis()
+    per_device = used.argument_size_in_bytes + used.output_size_in_bytes + used.temp_size_in_bytes
+    return Cost(seconds, steps / seconds, compiled - start, per_device * jax.device_count() / 1e6)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--cells", type=int, default=4, help="trainings; a multiple of the number of devices")
+    parser.add_argument(
+        "--cells", type=int, default=4, help="trainings; twice the number of devices, or a multiple of that"
+    )
     parser.add_argument("--steps", type=int, default=12_000, help="environment steps of a training")
     arguments = parser.parse_args()
     lines = ["| training | hidden layers | environment steps a second | compilation, s |", "|---|---|---|---|"]
@@ -52,10 +67,17 @@ def main() -> None:
         ("peps", 64, arguments.steps),
     ):
         config = Config(env="nav-d1", method=method, hidden_sizes=(width, width), total_steps=steps)
-        rates[method, width], compilation = rate(config, arguments.cells)
-        lines.append(f"| {method} | {width}, {width} | {rates[method, width]:,.0f} | {compilation:.1f} |")
+        taken = cost(config, arguments.cells)
+        rates[method, width] = taken.rate
+        lines.append(f"| {method} | {width}, {width} | {taken.rate:,.0f} | {taken.compilation:.1f} |")
     lines += ["", f"PEPS runs at {rates['peps', 64] / rates['sac', 64]:.0%} of SAC's rate; {jax.device_count()} devices, "
               f"{arguments.cells} cells."]  # fmt: skip
+    lines += ["", "| seeds of PEPS | seconds | seconds a seed | MB | MB a seed |", "|---|---|---|---|---|"]
+    for seeds in (arguments.cells // 2, arguments.cells, 2 * arguments.cells, 4 * arguments.cells):
+        taken = cost(Config(env="nav-d1", total_steps=arguments.steps), seeds)
+        lines.append(
+            f"| {seeds} | {taken.seconds:.1f} | {taken.seconds / seeds:.2f} | {taken.memory:.0f} | {taken.memory / seeds:.0f} |"
+        )
     FOLDER.mkdir(exist_ok=True)
     (FOLDER / "speed.md").write_text("\n".join(lines) + "\n")
     print("\n".join(lines))

@@ -1,0 +1,28 @@
+"""Copies measured tables into the README, so that no figure there is typed by hand.
+
+    make readme
+
+A table stands between `<!-- begin FILE -->` and `<!-- end -->`; FILE is what a measuring command wrote.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+
+
+def embedded(text: str) -> str:
+    """`text` with every marked place holding its file's content."""
+
+    def replace(match: re.Match) -> str:
+        content = (ROOT / match[1]).read_text().strip()
+        return f"<!-- begin {match[1]} -->\n{content}\n<!-- end -->"
+
+    return re.sub(r"<!-- begin (\S+) -->\n.*?<!-- end -->", replace, text, flags=re.DOTALL)
+
+
+if __name__ == "__main__":
+    README.write_text(embedded(README.read_text()))
