@@ -94,14 +94,14 @@ def request(arguments: Sequence[str], base: Config, num_episodes: int) -> Reques
     )
     wanted = [what for name in names for what in RESULTS[name].needs(made.study)]
     missing = made.study.missing(wanted, made.store)
-    made.study.batches([what for what in missing if isinstance(what, Training)])
+    made.study.batches([what for what in missing if isinstance(what, Training)])  # only to see that they fit
+    made.store.open()
     return made
 
 
 def run(wanted: Request) -> list[Path]:
     """Makes what is missing for each result, and writes it; returns the files."""
     written = []
-    wanted.store.open()
     for name in wanted.names:
         needs = RESULTS[name].needs(wanted.study)
         missing = wanted.study.missing(needs, wanted.store)

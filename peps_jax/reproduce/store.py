@@ -118,8 +118,17 @@ class Store:
             )
 
     def open(self) -> None:
-        """Makes the folder, and writes what it is about."""
-        (self.folder / CELLS).mkdir(parents=True, exist_ok=True)
+        """Makes the folder, and writes what it is about.
+
+        Raises:
+          ValueError: it can't be made.
+        """
+        try:
+            (self.folder / CELLS).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ValueError(
+                f"out {str(self.folder)!r} can't be made: {error.strerror}; choose another folder"
+            ) from None
         head = self._head | results.machine()
         results.write_whole(self.folder / HEAD, (json.dumps(head, indent=1, allow_nan=False) + "\n").encode())
 

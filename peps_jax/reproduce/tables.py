@@ -43,6 +43,12 @@ PAPER = {
         "policy_shaping": (89.17, 90.66, -181.46, 90.11),
     },
 }
+_NOTE = """\
+IQM: interquartile mean over seeds, with a 95 % stratified bootstrap interval; {episodes} episodes a seed by the policy's mode,
+"sampled" by its samples. Paper: Gong and Zhang 2021, Table 1. The planner knows dynamics, belief and rewards; "peps" is Eq. (6)
+at λ = {lam:g}. "human" acts, and is scored, in the MDP that the human believes in.
+"""
+
 Line = dict[str, Any]  # a line of a CSV file
 
 
@@ -189,9 +195,7 @@ def table1(study: Study, folder: Path) -> list[Path]:
     shown = [_cells(made, paper=True) for made in lines]
     text = [
         markdown(_head(paper=True), shown),
-        f"IQM: interquartile mean over seeds, with a 95 % stratified bootstrap interval; {study.num_episodes} episodes a seed by the "
-        'policy\'s mode, "sampled" by its samples. Paper: Gong and Zhang 2021, Table 1. The planner knows dynamics, belief and rewards; '
-        f'"peps" is Eq. (6) at λ = {study.base.lam:g}. What is "human" acts, and is scored, in the MDP that the human believes in.\n',
+        _NOTE.format(episodes=study.num_episodes, lam=study.base.lam),
         "Probability that a training of PEPS scores higher than one of the baseline, with its 95 % interval:\n",
         markdown(["domain", "baseline", *SCORES], [_improvement_cells(one) for one in improvements]),
         "Share of the way from SAC's to the planner's explicability, mean over seeds:\n",
