@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from peps_jax import batch
+from peps_jax import batch, plots
 from peps_jax.reproduce import __main__ as command
 from peps_jax.reproduce import store, study, tables
 from peps_jax.reproduce.store import Record, Store
@@ -236,7 +236,8 @@ def test_the_papers_numbers_say_what_the_paper_says():
 # --- the whole ------------------------------------------------------------------------------------------------------------
 
 
-def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_training):
+def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_training, monkeypatch):
+    monkeypatch.setattr(plots, "DOTS", 30)
     fill(tmp_path, tiny, seeds=3)
     assert call(["--seeds", 3, "--out", tmp_path], tiny) == 0
     written = {path.name for path in tmp_path.iterdir()} - {store.HEAD, store.CELLS}

@@ -94,7 +94,7 @@ def request(arguments: Sequence[str], base: Config, num_episodes: int) -> Reques
     )
     wanted = [what for name in names for what in RESULTS[name].needs(made.study)]
     missing = made.study.missing(wanted, made.store)
-    made.study.batches([what for what in missing if isinstance(what, Training)])  # only to see that they fit
+    made.study.batches([what for what in missing if isinstance(what, Training)][:1])  # to see, early, that one fits
     made.store.open()
     return made
 

@@ -20,16 +20,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import peps_envs
-import peps_jax
 from peps_jax import results, sweep
 from peps_jax.config import Config
 from peps_jax.evaluate import Evaluation
 
 HEAD, CELLS = "reproduce.json", "cells"
 ROUTES = 3  # episodes of each training whose route is kept
-# what decides a training's numbers beside its settings: files and folders of the two packages
+# what decides a training's numbers beside its settings: files and folders beside a module of each package
 CODE = {
-    peps_jax: ("parts", "methods", "train.py", "rollout.py", "evaluate.py", "explicability.py", "planner.py"),
+    results: ("parts", "methods", "train.py", "rollout.py", "evaluate.py", "explicability.py", "planner.py"),
     peps_envs: ("navigation.py",),
 }
 
@@ -75,8 +74,8 @@ def digest(*parts: Any) -> str:
 def code_digest() -> str:
     """A short name for the code that trains, evaluates and plans."""
     contents = {}
-    for package, names in CODE.items():
-        root = Path(package.__file__).parent
+    for module, names in CODE.items():
+        root = Path(module.__file__).parent
         for path in (root / name for name in names):
             for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
                 contents[str(file.relative_to(root.parent))] = file.read_text()
@@ -159,11 +158,11 @@ class Store:
         if not path.exists():
             return None
         try:
-            with np.load(path) as file:
+            with np.load(io.BytesIO(path.read_bytes())) as file:
                 arrays = dict(file)
             found, routes = str(arrays["digest"]), arrays["routes"]
             failed, seconds = bool(arrays["failed"]), float(arrays["seconds"])
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
             raise ValueError(f"file {str(path)!r} can't be read: remove it, and it is made again") from None
         if found != self.digest(recipe):
             raise ValueError(f"file {str(path)!r} was made with other settings: choose another folder")
