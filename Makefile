@@ -1,15 +1,19 @@
-# `make sweep` runs the main job, `make test` the tests; both set up what they need first. More arguments: make sweep ARGS="..."
+# `make sweep` runs the main job, `make reproduce` the paper's evaluation, `make test` the tests; all set up what they need first. More arguments: make sweep ARGS="..."
 SHELL := /bin/bash
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 ARGS ?=
 
-.PHONY: sweep test verify-navigation benchmark benchmark-highway readme lint lock setup
+.PHONY: sweep reproduce test verify-navigation benchmark benchmark-highway readme lint lock setup
 .DEFAULT_GOAL := sweep
 
 sweep: $(READY)
 	$(BIN)/python -m peps_jax.sweep $(ARGS)
+
+# the paper's evaluation; ARGS="table1 --seeds 3" for less of it
+reproduce: $(READY)
+	$(BIN)/python -m peps_jax.reproduce $(ARGS)
 
 test: $(READY)
 	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal --durations 10 $(ARGS)

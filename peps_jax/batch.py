@@ -190,12 +190,14 @@ def plan(
     num_episodes: int = 100,
     devices: Sequence[jax.Device] | None = None,
     free: int | None = None,
+    most: int | None = None,
 ) -> list[Batch]:
     """Divides cells into batches: one structure each, and split further where they would not fit in memory.
 
     Args:
       devices: that share the cells; all by default.
       free: bytes that each device has; measured by default.
+      most: cells in a batch at most, for a batch to be done and kept sooner; as many as fit by default.
 
     Raises:
       OutOfMemoryError: one cell for each device, or even a single one, is too much.
@@ -216,7 +218,7 @@ def plan(
                 f"{len(used)} devices has {_readable(AVAILABLE_SHARE * room)} for it: lower total_steps, batch_size, "
                 "updates_per_step, num_envs or the hidden sizes"
             )
-        number = -(-len(places) // fit)
+        number = -(-len(places) // (fit if most is None else min(fit, most)))
         per_device = -(-len(places) // (number * len(used)))  # batches of one size share one program
         slots = per_device * len(used)
         batches += [Batch(tuple(places[i : i + slots]), slots, used) for i in range(0, len(places), slots)]

@@ -47,7 +47,7 @@ FIRM = 0.5  # gain on sand from which it is drawn as in the paper's D4, darker: 
 DIRECTIONS = 16  # of full steps, over which the heat maps take the mean
 
 
-def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Figure, np.ndarray]:
+def panels_of(rows: int, columns: int, width: float, height: float) -> tuple[Figure, np.ndarray]:
     """A figure of panels `width` x `height` inches. Without pyplot: no display is asked for, and nothing is global."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -57,7 +57,7 @@ def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Figur
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def _tidy(axes: Axes) -> None:
+def tidy(axes: Axes) -> None:
     """No box, quiet ticks, a faint grid behind."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(QUIET)
@@ -66,7 +66,8 @@ def _tidy(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
-def _colour(method: str) -> str:
+def colour_of(method: str) -> str:
+    """A method's colour, the same in every figure."""
     return COLOURS[list(methods.METHODS).index(method) % len(COLOURS)]
 
 
@@ -105,11 +106,11 @@ def learning_curves(rows: Sequence[Row]) -> Figure | None:
     if not rows:
         return None
     envs, lam = _values(rows, lambda row: row.cell.env), _middle_lam(rows)
-    figure, panels = _figure(2, len(envs), 3.6, 2.3)
+    figure, panels = panels_of(2, len(envs), 3.6, 2.3)
     for column, env in enumerate(envs):
         for line, (curve, title) in enumerate((("return_", "return"), ("explicability", "explicability"))):
             axes = panels[line, column]
-            _tidy(axes)
+            tidy(axes)
             shown = []
             for method in _values(rows, lambda row: row.cell.method):
                 members = _of_method(rows, env, method, lam)
@@ -139,7 +140,7 @@ def _curve(axes: Axes, members: Sequence[Row], curve: str) -> np.ndarray:
     places = np.flatnonzero(np.isfinite(seeds).any(0))
     mean, low, high = (reduce(seeds[:, places], 0) for reduce in (np.nanmean, np.nanmin, np.nanmax))
     steps = (places + 1) * config.steps_per_round / 1000
-    colour = _colour(members[0].cell.method)
+    colour = colour_of(members[0].cell.method)
     axes.fill_between(steps, low, high, color=colour, alpha=0.16, linewidth=0)
     axes.plot(steps, mean, color=colour, linewidth=1.8, label=_label(members[0].cell.method, members[0].cell.lam))
     return mean[len(mean) // 5 :]
@@ -155,9 +156,9 @@ def frontier(rows: Sequence[Row]) -> Figure | None:
     if not rows:
         return None
     envs = _values(rows, lambda row: row.cell.env)
-    figure, panels = _figure(1, len(envs), 3.6, 3.1)
+    figure, panels = panels_of(1, len(envs), 3.6, 3.1)
     for axes, env in zip(panels[0], envs, strict=True):
-        _tidy(axes)
+        tidy(axes)
         for method in _values(rows, lambda row: row.cell.method):
             lams = _values(
                 [row for row in rows if (row.cell.env, row.cell.method) == (env, method)], lambda row: row.cell.lam
@@ -180,7 +181,7 @@ def _frontier_line(axes: Axes, points: Sequence[Sequence[Row]], method: str) -> 
     score = lambda row: (np.mean(row.finished.evaluation.return_), np.mean(row.finished.evaluation.explicability))
     seeds = [np.array([score(row) for row in members]) for members in points]
     means, spreads = np.array([s.mean(0) for s in seeds]), np.array([s.std(0) for s in seeds])
-    colour = _colour(method)
+    colour = colour_of(method)
     axes.scatter(*np.concatenate(seeds).T, s=9, color=colour, alpha=0.3, linewidth=0, zorder=2)
     axes.errorbar(
         *means.T, xerr=spreads[:, 0], yerr=spreads[:, 1], color=colour, linewidth=1.2, elinewidth=0.8, marker="o",
@@ -195,7 +196,7 @@ def _frontier_line(axes: Axes, points: Sequence[Sequence[Row]], method: str) -> 
 # --- maps -----------------------------------------------------------------------------------------------------------------
 
 
-def _map(axes: Axes, params: NavigationParams, heat: bool = False) -> None:
+def draw_map(axes: Axes, params: NavigationParams, heat: bool = False) -> None:
     """A domain as the paper draws it, y downwards: walls dark grey, pit brown, goal green, ice blue, sand yellow.
 
     On a `heat` map ice and sand are outlines, for the heat to be seen.
@@ -239,7 +240,7 @@ def routes(rows: Sequence[Row], episodes: int = 3) -> Figure | None:
         return None
     variant = lambda row: (row.cell.method, row.cell.lam if methods.get(row.cell.method).uses_lam else None)
     variants, envs = _values(rows, variant), _values(rows, lambda row: row.cell.env)
-    figure, panels = _figure(len(envs), len(variants), 2.5, 2.5)
+    figure, panels = panels_of(len(envs), len(variants), 2.5, 2.5)
     for line, env in enumerate(envs):
         for column, (method, lam) in enumerate(variants):
             members = {row.cell.training: row for row in rows if row.cell.env == env and variant(row) == (method, lam)}
@@ -256,19 +257,26 @@ def routes(rows: Sequence[Row], episodes: int = 3) -> Figure | None:
 
 
 def _routes_panel(axes: Axes, members: Sequence[Row], episodes: int) -> None:
-    from matplotlib.patheffects import Normal, Stroke
-
-    params = members[0].finished.result.config.task()[1]
-    _map(axes, params)
-    colour = _colour(members[0].cell.method)
+    draw_map(axes, members[0].finished.result.config.task()[1])
     for row in members:
         evaluation = row.finished.evaluation
         for route, length in zip(evaluation.perceived[:episodes], evaluation.length[:episodes], strict=True):
-            route = route[: int(length) + 1]
-            axes.plot(
-                *route.T, color=colour, linewidth=1.2, marker="o", markersize=2.2, alpha=max(0.35, 1 / len(members) ** 0.5),
-                solid_capstyle="round", path_effects=[Stroke(linewidth=2.4, foreground="white", alpha=0.5), Normal()], zorder=3,
-            )  # fmt: skip
+            draw_route(axes, route[: int(length) + 1], row.cell.method, max(0.35, 1 / len(members) ** 0.5))
+    draw_start(axes, members[0].finished.result.config.task()[1])
+
+
+def draw_route(axes: Axes, route: np.ndarray, method: str, alpha: float, width: float = 1.2) -> None:
+    """A route (steps + 1, 2) in its method's colour, a dot for each step."""
+    from matplotlib.patheffects import Normal, Stroke
+
+    axes.plot(
+        *route.T, color=colour_of(method), linewidth=width, marker="o", markersize=1.8 * width, alpha=alpha,
+        solid_capstyle="round", path_effects=[Stroke(linewidth=2 * width, foreground="white", alpha=0.5), Normal()], zorder=3,
+    )  # fmt: skip
+
+
+def draw_start(axes: Axes, params: NavigationParams) -> None:
+    """Where every route begins."""
     start = dict(marker="o", markersize=7, color="white", markeredgecolor=INK, markeredgewidth=1.3)
     axes.plot(*np.asarray(params.start), zorder=4, **start)
 
@@ -311,7 +319,7 @@ def _surrogate_values(environment: Navigation, config: Config, state: Any, posit
     return jax.tree.map(lambda value: value.mean(-1), values)
 
 
-def _rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
+def rank_correlation(a: np.ndarray, b: np.ndarray) -> float:
     """Spearman's, without ties."""
     ranks = [np.argsort(np.argsort(values)) for values in (a, b)]
     return float(np.corrcoef(*ranks)[0, 1])
@@ -327,20 +335,20 @@ def surrogate_maps(rows: Sequence[Row]) -> Figure | None:
     for row in rows:
         if row.cell.lam == lam:
             first.setdefault((row.cell.env, row.cell.method), row)
-    figure, panels = _figure(len(first), 2, 3.3, 2.75)
+    figure, panels = panels_of(len(first), 2, 3.3, 2.75)
     for line, ((env, method), row) in enumerate(first.items()):
         learned, true, free = surrogate_values(row.finished.result)
         params = row.finished.result.config.task()[1]
-        agreement = _rank_correlation(learned[free], true[free])
+        agreement = rank_correlation(learned[free], true[free])
         titles = (f"learned r̂  (rank correlation {agreement:.2f})", "true ℓ_H + r_H")
         for axes, values, title in zip(panels[line], (learned, true), titles, strict=True):
-            _heat(figure, axes, np.where(free, values, np.nan), params)
+            draw_heat(figure, axes, np.where(free, values, np.nan), params)
             axes.set_title(title, color=INK, fontsize=9)
         panels[line, 0].set_ylabel(f"{env}, {method}, seed {row.cell.seed}", color=INK, fontsize=9)
     return figure
 
 
-def _heat(figure: Figure, axes: Axes, values: np.ndarray, params: NavigationParams) -> None:
+def draw_heat(figure: Figure, axes: Axes, values: np.ndarray, params: NavigationParams) -> None:
     """Values over the arena, as colours of asinh((value - median) / spread).
 
     Next to the goal and the pit they are a hundred times those elsewhere; asinh shows both.
@@ -353,7 +361,7 @@ def _heat(figure: Figure, axes: Axes, values: np.ndarray, params: NavigationPara
     norm = FuncNorm((forward, back), vmin=low, vmax=max(high, low + 1e-6), clip=True)
     extent = (0, *np.asarray(params.size), 0)  # left, right, bottom, top: y downwards
     image = axes.imshow(values, extent=extent, cmap="cividis", norm=norm, interpolation="nearest", zorder=0)
-    _map(axes, params, heat=True)
+    draw_map(axes, params, heat=True)
     ticks = back(np.linspace(forward(low), forward(high), 5))
     bar = figure.colorbar(image, ax=axes, shrink=0.85, pad=0.02, ticks=ticks)
     bar.ax.set_yticks(ticks, [f"{tick:.2g}" if abs(tick) < 10 else f"{tick:.0f}" for tick in ticks])

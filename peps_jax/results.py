@@ -121,7 +121,7 @@ class Writer:
 
     def __init__(self, folder: Path, command: str, settings: Mapping[str, Any]):
         self.folder = folder
-        self._head = {"command": command, "configuration": _plain(settings)} | _machine()
+        self._head = {"command": command, "configuration": plain(settings)} | machine()
         self._trainings: set[str] = set()
 
     def save(self, rows: Sequence[Row], times: Times, env_steps: int, status: str) -> None:
@@ -137,7 +137,7 @@ class Writer:
                 write_whole(self.folder / row.cell.file, _learned(row.finished.result))
                 self._trainings.add(row.cell.training)
         write_whole(self.folder / CURVES, _curves(rows))
-        write_whole(self.folder / TABLE, _table([record(row) for row in rows]))
+        write_whole(self.folder / TABLE, table([record(row) for row in rows]))
         manifest = self._head | {
             "status": status,
             "compile_seconds": round(times.compile, 3),
@@ -159,7 +159,8 @@ def _clear(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def _machine() -> dict[str, Any]:
+def machine() -> dict[str, Any]:
+    """Versions of what computes, and the devices."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -170,12 +171,12 @@ def _machine() -> dict[str, Any]:
     return {"versions": versions, "devices": devices}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """`value` as JSON knows it; numbers that it doesn't, inf and nan, as text that `float` reads."""
     if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return value
@@ -211,7 +212,8 @@ def _curves(rows: Sequence[Row]) -> bytes:
     return buffer.getvalue()
 
 
-def _table(records: Sequence[Mapping[str, Any]]) -> bytes:
+def table(records: Sequence[Mapping[str, Any]]) -> bytes:
+    """`records` as CSV; a column for every name that any of them has."""
     columns = list(dict.fromkeys(name for line in records for name in line))  # worlds may differ in their events
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, columns, lineterminator="\n")

@@ -118,7 +118,7 @@ def _shown(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
 
 
-def _options(default: Any) -> dict[str, Any]:
+def options(default: Any) -> dict[str, Any]:
     """How argparse reads a field whose default is `default`."""
     if isinstance(default, bool):
         return {"action": argparse.BooleanOptionalAction}
@@ -149,13 +149,13 @@ def parser() -> Parser:
         values = DEMONSTRATION[name]
         group.add_argument(f"--{name}", nargs="+", default=values, help=f"{texts[name]} [{_shown(values)}]", **kind)
     text = "seeds for each: --seed and those after it [2]"
-    group.add_argument("--seeds", default=2, help=text, **_options(2))
+    group.add_argument("--seeds", default=2, help=text, **options(2))
 
     group = made.add_argument_group("results")
     group.add_argument("--out", default="results/sweep", metavar="DIR", help="folder to write [results/sweep]")
     group.add_argument("--overwrite", action="store_true", help="replace the results that the folder holds")
     text = "evaluation episodes, by the policy's mode [100]"
-    group.add_argument("--episodes", default=100, help=text, **_options(100))
+    group.add_argument("--episodes", default=100, help=text, **options(100))
     group.add_argument("-h", "--help", action="help", help="show this and exit")
 
     groups = {name: made.add_argument_group(title) for name, title in TITLES.items()}
@@ -167,7 +167,7 @@ def parser() -> Parser:
             groups[name] = made.add_argument_group(name)
         text = field.metadata.get("help", "") + ("" if field.default is None else f" [{_shown(field.default)}]")
         flag = f"--{field.name.replace('_', '-')}"
-        groups[name].add_argument(flag, default=field.default, help=text.replace("%", "%%"), **_options(field.default))
+        groups[name].add_argument(flag, default=field.default, help=text.replace("%", "%%"), **options(field.default))
     return made
 
 
@@ -210,6 +210,11 @@ def _check_folder(out: Path, overwrite: bool) -> None:
         raise ValueError(
             f"out {str(out)!r} holds another run's results: choose another folder, or add --overwrite to replace them"
         )
+    check_writable(out)
+
+
+def check_writable(out: Path) -> None:
+    """Raises ValueError, in one line, if no folder can be made or written at `out`."""
     existing = next(path for path in (out, *out.absolute().parents) if path.exists())
     if not existing.is_dir():
         raise ValueError(f"out {str(out)!r} can't be a folder: {str(existing)!r} is a file; choose another name")
@@ -342,27 +347,40 @@ class Sweep:
 
     def run(self) -> None:
         """Runs batch by batch, and saves after each."""
-        steps = lambda config: config.num_rounds * config.steps_per_round
         self._wanted.out.mkdir(parents=True, exist_ok=True)
-        with Display(sum(map(steps, self._configs))) as display:
-            for number, current in enumerate(self.batches, 1):
-                cells = [self._configs[place] for place in current.cells]
-                name = f"{cells[0].method}, {len(cells)} cells" + f", batch {number}/{len(self.batches)}" * (
-                    len(self.batches) > 1
-                )
-                display.say(f"compiling {name}")
-                program, compiling = batch.program(cells[0], current, self._wanted.episodes)
-                display.begin(f"training {name}")
-                share = len(cells) * cells[0].steps_per_round
-                report = lambda done, curves, share=share: display.progress(share * _rounds(curves), curves)
-                finished, running = program.run(cells, report)
-                self._finished |= {
-                    self._names[place]: cell for place, cell in zip(current.cells, finished, strict=True)
-                }
-                self._times += compiling + running
-                self._env_steps += sum(map(steps, cells))
-                self.save("running")
+        train_batches(self._configs, self.batches, self._wanted.episodes, self._keep)
         self.save("complete")
+
+    def _keep(self, places: Sequence[int], finished: Sequence[batch.Finished], times: batch.Times) -> None:
+        self._finished |= {self._names[place]: cell for place, cell in zip(places, finished, strict=True)}
+        self._times += times
+        self._env_steps += sum(_steps(self._configs[place]) for place in places)
+        self.save("running")
+
+
+Keep = Callable[
+    [Sequence[int], Sequence[batch.Finished], batch.Times], None
+]  # places in the list, their cells, seconds
+
+
+def train_batches(configs: Sequence[Config], batches: Sequence[batch.Batch], episodes: int, keep: Keep) -> None:
+    """Trains and evaluates `configs` as `batches` divide them, with progress on stderr; `keep` gets each batch when it is done."""
+    with Display(sum(map(_steps, configs))) as display:
+        for number, current in enumerate(batches, 1):
+            cells = [configs[place] for place in current.cells]
+            name = f"{cells[0].method}, {len(cells)} cells" + f", batch {number}/{len(batches)}" * (len(batches) > 1)
+            display.say(f"compiling {name}")
+            program, compiling = batch.program(cells[0], current, episodes)
+            display.begin(f"training {name}")
+            share = len(cells) * cells[0].steps_per_round
+            report = lambda done, curves, share=share: display.progress(share * _rounds(curves), curves)
+            finished, running = program.run(cells, report)
+            keep(current.cells, finished, compiling + running)
+
+
+def _steps(config: Config) -> int:
+    """Environment steps of a training."""
+    return config.num_rounds * config.steps_per_round
 
 
 def _rounds(curves: dict[str, np.ndarray]) -> int:

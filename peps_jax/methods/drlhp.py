@@ -3,7 +3,8 @@
 The teacher, the budget and the choice of queries are PEPS's. That paper's own (Sec. 2.2.1 and 2.2.3): every member of the
 ensemble is normalised by itself, to mean 0 and a fixed standard deviation over what was visited; a share 1/e of the answers,
 what a member's resample leaves out, validates it and moves its weight decay; and 10 % of the answers count as random. Its
-normalisation leaves no level to r-hat: it was made for tasks without an end.
+normalisation leaves no level to r-hat: it was made for tasks without an end. `DRLHP_UNSCALED` leaves the normalisation out, so
+that r-hat keeps the level and the scale that the answers give it.
 """
 
 from __future__ import annotations
@@ -14,3 +15,4 @@ from peps_jax.parts.surrogate import Recipe
 RECIPE = Recipe(level="standard", uniform_answers=0.1, validates=True)
 
 DRLHP = feedback.method("drlhp", rewards=(feedback.reward,), recipe=RECIPE)
+DRLHP_UNSCALED = feedback.method("drlhp_unscaled", rewards=(feedback.reward,), recipe=RECIPE._replace(level="none"))

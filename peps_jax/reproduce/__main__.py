@@ -1,0 +1,145 @@
+"""The command line.
+
+    python -m peps_jax.reproduce table1 figure1 --out results/reproduce
+
+A stopped command continues where it was. Bad input gets one line on stderr and exit code 2 before anything compiles; Ctrl-C
+keeps the batches that are finished, with exit code 130.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from peps_envs.registry import unknown_name
+from peps_jax.config import Config
+from peps_jax.reproduce import figures, tables
+from peps_jax.reproduce.store import Store
+from peps_jax.reproduce.study import DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
+from peps_jax.sweep import Parser, options, use_every_core
+
+PROG = "python -m peps_jax.reproduce"
+MOST = 1000  # seeds
+DESCRIPTION = f"""\
+The paper's evaluation: {", ".join(METHODS)} on {", ".join(DOMAINS)},
+each with every seed, and the known-model planner beside them. Trainings are kept in
+the folder: a stopped command continues where it was, and results share them."""
+
+
+class Result(NamedTuple):
+    """Something to reproduce."""
+
+    text: str
+    needs: Callable[[Study], list[Training | Planned]]
+    write: Callable[[Study, Path], list[Path]]
+
+
+RESULTS = {
+    "table1": Result("return and explicability of every method", tables.table1_needs, tables.table1),
+    "figure1": Result("the learned surrogate reward beside the true one", figures.figure1_needs, figures.figure1),
+    "figure2": Result("rollouts of every method", figures.figure2_needs, figures.figure2),
+    "frontier": Result("return and explicability over lambda", figures.frontier_needs, figures.frontier),
+    "queries": Result("explicability over the number of queries", figures.queries_needs, figures.queries),
+    "ablations": Result("PEPS and DRLHP without parts of them", tables.ablations_needs, tables.ablations),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """What a command line asks for, checked."""
+
+    names: tuple[str, ...]  # of results
+    study: Study
+    store: Store
+
+
+def parser() -> Parser:
+    """The command line's parser."""
+    texts = "\n".join(f"  {name:10} {result.text}" for name, result in RESULTS.items())
+    epilog = f"results:\n{texts}\n  {'all':10} all of them\n\nThe last three take the first {FEW_SEEDS} seeds."
+    made = Parser(
+        prog=PROG, usage=f"{PROG} [RESULT ...] [flags]", description=DESCRIPTION, epilog=epilog, allow_abbrev=False,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    made.add_argument("results", nargs="*", default=["all"], metavar="RESULT", help="what to reproduce [all]")
+    made.add_argument("--out", default="results/reproduce", metavar="DIR", help="folder [results/reproduce]")
+    made.add_argument("--seeds", default=10, help="trainings of each method in each domain [10]", **options(10))
+    steps = Config().total_steps
+    made.add_argument("--steps", default=None, help=f"environment steps of a training [{steps}]", **options(steps))
+    return made
+
+
+def request(arguments: Sequence[str], base: Config, num_episodes: int) -> Request:
+    """Reads and checks a command line.
+
+    Raises:
+      ValueError: a value makes no sense, or the folder holds something else.
+      SystemExit: a flag that doesn't exist or can't be read (code 2), or --help (code 0).
+    """
+    values = parser().parse(arguments)
+    for name in values.results:
+        if name not in (*RESULTS, "all"):
+            raise ValueError(unknown_name("result", name, (*RESULTS, "all")))
+    if not 2 <= values.seeds <= MOST:
+        raise ValueError(f"seeds {values.seeds} is out of range: choose 2 to {MOST} (an interval needs two)")
+    base = base if values.steps is None else base.replace(total_steps=values.steps)
+    base.check()
+    names = tuple(RESULTS) if "all" in values.results else tuple(dict.fromkeys(values.results))
+    made = Request(
+        names, Study(base, values.seeds, num_episodes), Store(Path(values.out), base, num_episodes, values.seeds)
+    )
+    wanted = [what for name in names for what in RESULTS[name].needs(made.study)]
+    missing = made.study.missing(wanted, made.store)
+    made.study.batches([what for what in missing if isinstance(what, Training)][:1])  # to see, early, that one fits
+    made.store.open()
+    return made
+
+
+def run(wanted: Request) -> list[Path]:
+    """Makes what is missing for each result, and writes it; returns the files."""
+    written = []
+    for name in wanted.names:
+        needs = RESULTS[name].needs(wanted.study)
+        missing = wanted.study.missing(needs, wanted.store)
+        number = len({what.name for what in needs})
+        print(f"{name}: {number - len(missing)} of {number} trainings and plans are there", file=sys.stderr, flush=True)
+        wanted.study.make(missing, wanted.store)
+        written += RESULTS[name].write(wanted.study, wanted.store.folder)
+    return written
+
+
+def main(arguments: Sequence[str] | None = None, base: Config | None = None, num_episodes: int = 100) -> int:
+    """Runs the command line; returns the exit code.
+
+    Args:
+      arguments: of the command line; the process's own by default.
+      base: settings of every training; the package's defaults by default.
+      num_episodes: rollouts of each training.
+    """
+    use_every_core()
+    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        wanted = request(arguments, Config() if base is None else base, num_episodes)
+    except ValueError as error:
+        print(f"{PROG}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    try:
+        written = run(wanted)
+    except KeyboardInterrupt:
+        print(
+            f"\nstopped: what is finished is kept in {wanted.store.folder}; the same command continues", file=sys.stderr
+        )
+        return 130
+    for path in written:
+        if path.suffix == ".md":
+            print(path.read_text())
+    print(f"in {wanted.store.folder}: {', '.join(path.name for path in written)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

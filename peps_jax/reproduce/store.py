@@ -1,0 +1,172 @@
+"""What is kept of each training and each plan: one file for each, whole or not there.
+
+    reproduce.json   what the folder is about: settings, code, seeds, versions, devices
+    cells/*.npz      a `Record` and the digest of what made it
+
+A folder holds one configuration. Another one's trainings, or those of other code, are never mixed with it or replaced.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import peps_envs
+from peps_jax import results, sweep
+from peps_jax.config import Config
+from peps_jax.evaluate import Evaluation
+
+HEAD, CELLS = "reproduce.json", "cells"
+ROUTES = 3  # episodes of each training whose route is kept
+# what decides a training's numbers beside its settings: files and folders beside a module of each package
+CODE = {
+    results: ("parts", "methods", "train.py", "rollout.py", "evaluate.py", "explicability.py", "planner.py"),
+    peps_envs: ("navigation.py",),
+}
+
+
+class Record(NamedTuple):
+    """What is kept of a training, or of a plan."""
+
+    mode: dict[str, np.ndarray]  # (episodes,) each: return, explicability, ... of the policy's mode
+    sampled: dict[str, np.ndarray]  # the same of its samples; nothing of a plan
+    routes: np.ndarray  # (ROUTES, horizon + 1, 2) positions; the last one is repeated after the end
+    heat: dict[str, np.ndarray]  # (rows, columns) each: learned, true, free; nothing without r-hat
+    failed: bool  # something that was learned or evaluated isn't finite
+    seconds: float  # of wall clock
+
+    def mean(self, name: str, sampled: bool = False) -> float:
+        """Mean over episodes."""
+        return float(np.mean((self.sampled if sampled else self.mode)[name]))
+
+
+def episodes(evaluation: Evaluation) -> dict[str, np.ndarray]:
+    """The numbers of each episode, (episodes,) each."""
+    figures = {
+        "return": evaluation.return_,
+        "explicability": evaluation.explicability,
+        "explicability_with_policy": evaluation.explicability_with_policy,
+        "belief_gap": evaluation.belief_gap,
+        "human_return": evaluation.human_return,
+        "length": evaluation.length,
+    }
+    return {name: np.asarray(values, np.float32) for name, values in (figures | evaluation.events).items()}
+
+
+def settings_of(config: Config) -> dict[str, Any]:
+    """Every setting, as JSON knows it."""
+    return results.plain({field.name: getattr(config, field.name) for field in dataclasses.fields(Config)})
+
+
+def digest(*parts: Any) -> str:
+    """A short name for `parts`, which JSON knows."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def code_digest() -> str:
+    """A short name for the code that trains, evaluates and plans."""
+    contents = {}
+    for module, names in CODE.items():
+        root = Path(module.__file__).parent
+        for path in (root / name for name in names):
+            for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+                contents[str(file.relative_to(root.parent))] = file.read_text()
+    return digest(contents)
+
+
+class Store:
+    """A folder of records. Opening it checks, and writes nothing.
+
+    Raises:
+      ValueError: the folder holds something else, or what other settings, other code or more seeds made.
+    """
+
+    def __init__(self, folder: Path, config: Config, num_episodes: int, seeds: int):
+        self.folder = folder
+        self._code = code_digest()
+        self._episodes = num_episodes
+        self._head = {"settings": settings_of(config) | {"episodes": num_episodes}, "code": self._code, "seeds": seeds}
+        sweep.check_writable(folder)
+        self._check()
+
+    def _check(self) -> None:
+        name, advice = f"out {str(self.folder)!r}", "choose another folder"
+        if not self.folder.exists() or not any(self.folder.iterdir()):
+            return
+        try:
+            head = json.loads((self.folder / HEAD).read_text())
+            settings, code, seeds = head["settings"], head["code"], head["seeds"]
+        except (OSError, ValueError, KeyError):
+            raise ValueError(f"{name} isn't empty and holds no reproduction ({HEAD}): {advice}") from None
+        for setting, value in self._head["settings"].items():
+            if settings.get(setting) != value:
+                raise ValueError(f"{name} was made with {setting} {settings.get(setting)}, not {value}: {advice}")
+        if code != self._code:
+            raise ValueError(f"{name} was made by other code (that of training, evaluation or worlds): {advice}")
+        if seeds > self._head["seeds"]:
+            raise ValueError(
+                f"{name} has tables of {seeds} seeds, more than {self._head['seeds']}: give --seeds {seeds} or more, or {advice}"
+            )
+
+    def open(self) -> None:
+        """Makes the folder, and writes what it is about.
+
+        Raises:
+          ValueError: it can't be made.
+        """
+        try:
+            (self.folder / CELLS).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ValueError(
+                f"out {str(self.folder)!r} can't be made: {error.strerror}; choose another folder"
+            ) from None
+        head = self._head | results.machine()
+        results.write_whole(self.folder / HEAD, (json.dumps(head, indent=1, allow_nan=False) + "\n").encode())
+
+    def _path(self, name: str) -> Path:
+        return self.folder / CELLS / f"{name}.npz"
+
+    def digest(self, recipe: Mapping[str, Any]) -> str:
+        """What tells the record of `recipe` from any other: settings, code, and number of episodes."""
+        return digest(recipe, self._code, self._episodes)
+
+    def save(self, name: str, recipe: Mapping[str, Any], record: Record) -> None:
+        """Keeps a record."""
+        arrays = {"digest": np.array(self.digest(recipe)), "routes": record.routes, "failed": record.failed}
+        arrays["seconds"] = np.array(record.seconds)
+        for part in ("mode", "sampled", "heat"):
+            arrays |= {f"{part}/{key}": values for key, values in getattr(record, part).items()}
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **arrays)
+        results.write_whole(self._path(name), buffer.getvalue())
+
+    def load(self, name: str, recipe: Mapping[str, Any]) -> Record | None:
+        """The record called `name`, or None if there is none.
+
+        Raises:
+          ValueError: it can't be read, or something other than `recipe` made it.
+        """
+        path = self._path(name)
+        if not path.exists():
+            return None
+        try:
+            with np.load(io.BytesIO(path.read_bytes())) as file:
+                arrays = dict(file)
+            found, routes = str(arrays["digest"]), arrays["routes"]
+            failed, seconds = bool(arrays["failed"]), float(arrays["seconds"])
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
+            raise ValueError(f"file {str(path)!r} can't be read: remove it, and it is made again") from None
+        if found != self.digest(recipe):
+            raise ValueError(f"file {str(path)!r} was made with other settings: choose another folder")
+        part = lambda name: {
+            key.partition("/")[2]: value for key, value in arrays.items() if key.startswith(f"{name}/")
+        }
+        return Record(part("mode"), part("sampled"), routes, part("heat"), failed, seconds)

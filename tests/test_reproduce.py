@@ -1,0 +1,292 @@
+"""The reproduction: what it refuses, what it keeps, what its tables say, and that a stopped command continues."""
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+
+from peps_jax import batch, plots
+from peps_jax.reproduce import __main__ as command
+from peps_jax.reproduce import store, study, tables
+from peps_jax.reproduce.store import Record, Store
+from peps_jax.reproduce.study import DOMAINS, METHODS, Study
+from peps_jax.statistics import Estimate
+
+PREFIX = "python -m peps_jax.reproduce: error: "
+EPISODES = 4
+
+
+def call(arguments, tiny) -> int:
+    """The exit code of a command line."""
+    try:
+        return command.main(list(map(str, arguments)), tiny, EPISODES)
+    except SystemExit as exit:
+        return exit.code
+
+
+@pytest.fixture
+def no_training(monkeypatch):
+    """Nothing may be compiled or planned."""
+
+    def refuse(*arguments):
+        raise AssertionError("compiled")
+
+    monkeypatch.setattr(batch, "Program", refuse)
+    monkeypatch.setattr(study, "_plan_and_walk", refuse)
+
+
+def made_up(value: float, failed: bool = False, horizon: int = 6) -> Record:
+    """A record whose every score is `value`."""
+    names = ("return", "explicability", "human_return", "length", "goal_reached")
+    figures = {name: np.full(EPISODES, value, np.float32) for name in names} | {"length": np.full(EPISODES, 5.0)}
+    heat = {
+        name: np.linspace(-value, value, 144).reshape(12, 12) ** power for name, power in (("learned", 1), ("true", 3))
+    }
+    routes = np.cumsum(np.full((store.ROUTES, horizon, 2), 0.5), 1)
+    return Record(figures, figures, routes, heat | {"free": np.ones((12, 12), bool)}, failed, seconds=1.0)
+
+
+def fill(folder, base, seeds: int) -> None:
+    """A folder that has every training and plan, all made up."""
+    made, kept = Study(base, seeds, EPISODES), Store(folder, base, EPISODES, seeds)
+    kept.open()
+    for place, what in enumerate(every_need(made).values()):
+        kept.save(what.name, what.recipe, made_up(80 + place % 7, failed="drlhp-seed1" in what.name))
+
+
+def every_need(made: Study) -> dict:
+    return {what.name: what for result in command.RESULTS.values() for what in result.needs(made)}
+
+
+def lines_of(path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+# --- bad input ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        ("tabel1", ("result 'tabel1'", "did you mean 'table1'")),
+        ("--seeds 1", ("seeds 1", "choose 2 to")),
+        ("--seeds few", ("--seeds", "'few' is not a whole number")),
+        ("--steps 0", ("total_steps 0", "from 1 on")),
+        ("--step 3", ("'--step'", "did you mean --steps?")),
+        ("--steps 100000000000000", ("needs about", "lower total_steps")),
+    ],
+)
+def test_bad_input_is_one_line(arguments, parts, tmp_path, capsys, tiny, no_training):
+    assert call([*arguments.split(), "--out", tmp_path / "out"], tiny) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith(PREFIX)
+    assert captured.err.count("\n") == 1
+    assert all(part in captured.err for part in parts), captured.err
+    assert not captured.out
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_of_something_else_is_not_written(tmp_path, capsys, tiny, no_training):
+    (tmp_path / "table1.md").write_text("precious")
+    assert call(["--out", tmp_path], tiny) == 2
+    assert "holds no reproduction" in capsys.readouterr().err
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["precious"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "changes", "message"),
+    [
+        (["--steps", 80], {}, "made with total_steps 160, not 80"),
+        ([], {"lam": 1.0}, "made with lam 2.4, not 1.0"),
+        (["--seeds", 2], {}, "has tables of 3 seeds, more than 2"),
+    ],
+)
+def test_a_folder_of_another_configuration_is_refused(arguments, changes, message, tmp_path, capsys, tiny, no_training):
+    Store(tmp_path, tiny, EPISODES, seeds=3).open()
+    before = (tmp_path / store.HEAD).read_bytes()
+    assert call(["--seeds", 3, *arguments, "--out", tmp_path], tiny.replace(**changes)) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert (tmp_path / store.HEAD).read_bytes() == before
+
+
+def test_a_folder_made_by_other_code_is_refused(tmp_path, tiny, monkeypatch):
+    Store(tmp_path, tiny, EPISODES, seeds=3).open()
+    Store(tmp_path, tiny, EPISODES, seeds=4)
+    monkeypatch.setattr(store, "code_digest", lambda: "another")
+    with pytest.raises(ValueError, match="made by other code"):
+        Store(tmp_path, tiny, EPISODES, seeds=3)
+
+
+# --- the store ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_record_comes_back_as_it_was(tmp_path, tiny):
+    kept = Store(tmp_path, tiny, EPISODES, seeds=2)
+    kept.open()
+    record, recipe = made_up(3.0, failed=True), store.settings_of(tiny)
+    assert kept.load("cell", recipe) is None
+    kept.save("cell", recipe, record)
+    again = kept.load("cell", recipe)
+    assert (again.failed, again.seconds) == (True, 1.0)
+    np.testing.assert_array_equal(again.routes, record.routes)
+    for part in ("mode", "sampled", "heat"):
+        assert set(getattr(again, part)) == set(getattr(record, part))
+        for name, values in getattr(record, part).items():
+            np.testing.assert_array_equal(getattr(again, part)[name], values)
+    with pytest.raises(ValueError, match="made with other settings"):
+        kept.load("cell", store.settings_of(tiny.replace(seed=7)))
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 half a file"])
+def test_a_broken_file_is_said(content, tmp_path, tiny):
+    kept = Store(tmp_path, tiny, EPISODES, seeds=2)
+    kept.open()
+    (tmp_path / store.CELLS / "cell.npz").write_bytes(content)
+    with pytest.raises(ValueError, match="can't be read: remove it"):
+        kept.load("cell", {})
+
+
+# --- trainings ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_change_that_changes_nothing_is_the_same_training(tiny):
+    made = Study(tiny, 3, EPISODES)
+    plain = made.training("nav-d1", "peps", 2)
+    assert plain.name == "nav-d1-peps-seed2"
+    assert made.training("nav-d1", "peps", 2, lam=tiny.lam, num_queries=tiny.num_queries) == plain
+    other = made.training("nav-d1", "peps", 2, lam=1.0)
+    assert other.name == "nav-d1-peps-lam-1.0-seed2"
+    assert other.config == plain.config.replace(lam=1.0)
+    assert len(made.trainings("nav-d1", "peps", 9)) == 3, "never more seeds than the study's"
+
+
+def test_names_tell_recipes_apart(tiny):
+    made = Study(tiny, 3, EPISODES)
+    by_name: dict[str, set[str]] = {}
+    for result in command.RESULTS.values():
+        for what in result.needs(made):
+            by_name.setdefault(what.name, set()).add(json.dumps(what.recipe, sort_keys=True))
+    assert all(len(recipes) == 1 for recipes in by_name.values())
+    assert len({recipe for recipes in by_name.values() for recipe in recipes}) == len(by_name)
+
+
+def test_the_typical_training_is_the_median_one(tiny, monkeypatch):
+    made = Study(tiny, 4, EPISODES)
+    trainings = made.trainings("nav-d1", "peps")
+    values = dict(zip(trainings, (made_up(5.0), made_up(1.0), made_up(4.0), made_up(4.4, failed=True)), strict=True))
+    monkeypatch.setattr(made, "record", values.__getitem__)
+    assert made.typical(trainings, lambda record: record.mean("return")) == trainings[2]
+    assert made.typical(trainings[3:], lambda record: record.mean("return")) is None
+
+
+# --- tables ---------------------------------------------------------------------------------------------------------------
+
+
+def test_numbers_in_a_table():
+    assert tables.with_interval(Estimate(1.04, -2.0, 3.96)) == "1.0 [-2.0, 4.0]"
+    assert tables.with_interval(Estimate(math.nan, math.nan, math.nan)) == "–"
+    assert tables.figure(None) == "–"
+    assert tables.figure(0.5, 2) == "0.50"
+
+
+def test_markdown_and_latex():
+    head, rows = ["a", "b", "c"], [["x", "50 %", "1 ± 2"], ["x", "a_b", "–"], ["y", "r̂", "λ"]]
+    assert tables.markdown(head, rows).splitlines()[1:3] == ["|---|---|---|", "| x | 50 % | 1 ± 2 |"]
+    text = tables.latex(head, rows)
+    assert text.startswith("\\begin{tabular}{llr}\n\\toprule\na & b & c \\\\\n\\midrule\n")
+    assert r"x & 50 \% & 1 $\pm$ 2 \\" in text
+    assert text.count(r"\midrule") == 2, "one under the head, and one between x and y"
+    assert r"y & $\hat r$ & $\lambda$ \\" in text
+
+
+def test_a_line_of_known_scores():
+    records = [made_up(value) for value in (0.0, 10.0, 20.0, 90.0)]
+    made = tables.line(["nav-d1"], "peps", [records], trained=5)
+    assert (made["domain"], made["seeds"], made["failed"]) == ("nav-d1", 4, 1)
+    assert made["return"] == 15.0, "the middle half"
+    assert made["return_mean"] == 30.0
+    assert made["return_low"] <= 15.0 <= made["return_high"]
+    assert made["return_sd"] == pytest.approx(np.std([0, 10, 20, 90]))
+    everywhere = tables.line(DOMAINS, "peps", [records] * 3 + [records[:2]], trained=16)
+    assert (everywhere["domain"], everywhere["failed"]) == ("all", 2)
+    assert everywhere["explicability"] == 5.0, "as many seeds of each domain as the fewest"
+
+
+def test_one_seed_has_no_interval():
+    made = tables.line(["nav-d1"], "peps", [[made_up(1.0)]], trained=2)
+    assert math.isnan(made["return"])
+    assert made["return_mean"] == 1.0
+
+
+def test_the_papers_numbers_say_what_the_paper_says():
+    """Sec. 5.1: PEPS has the highest explicability everywhere, and its return is close to the best."""
+    for place in range(len(DOMAINS)):
+        explicability = {method: values[place] for method, values in tables.PAPER["explicability"].items()}
+        returns = {method: values[place] for method, values in tables.PAPER["return"].items()}
+        assert max(explicability, key=explicability.get) == "peps"
+        assert max(returns.values()) - returns["peps"] < 2
+        assert all(explicability[method] <= returns[method] for method in returns), "l_H - l_A costs on average"
+
+
+# --- the whole ------------------------------------------------------------------------------------------------------------
+
+
+def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_training, monkeypatch):
+    monkeypatch.setattr(plots, "DOTS", 30)
+    fill(tmp_path, tiny, seeds=3)
+    assert call(["--seeds", 3, "--out", tmp_path], tiny) == 0
+    written = {path.name for path in tmp_path.iterdir()} - {store.HEAD, store.CELLS}
+    pictures = ("figure1", "figure2", "frontier", "queries")
+    assert written == {"improvement.csv"} | {
+        f"{name}.{kind}" for name in pictures for kind in ("png", "pdf", "csv")
+    } | {f"{name}.{kind}" for name in ("table1", "ablations") for kind in ("md", "csv", "tex")}
+    lines = lines_of(tmp_path / "table1.csv")
+    assert len(lines) == len(DOMAINS) * (len(METHODS) + 3) + len(METHODS)
+    failing = next(line for line in lines if (line["domain"], line["method"]) == ("nav-d1", "drlhp"))
+    assert (failing["seeds"], failing["failed"], failing["return_paper"]) == ("2", "1", "74.51")
+    assert "2 (1 failed)" in (tmp_path / "table1.md").read_text()
+    assert "table1.tex" in capsys.readouterr().out
+    assert {line["strategy"] for line in lines_of(tmp_path / "queries.csv")} > {"information_gain", "random"}
+    assert {line["method"] for line in lines_of(tmp_path / "frontier.csv")} > {"planner", "peps", "sac"}
+    before = {path: path.read_bytes() for path in tmp_path.glob("*.p*")}
+    assert call(["figure2", "--seeds", 3, "--out", tmp_path], tiny) == 0
+    assert {path: path.read_bytes() for path in before} == before, "the same numbers make the same files"
+
+
+@pytest.mark.slow
+def test_a_stopped_table_continues(tmp_path, capsys, tiny, monkeypatch):
+    monkeypatch.setattr(study, "PLANNER", {name: dict(points=1, resolution=13) for name in study.PLANNER})
+    compiled, methods_asked = batch.program, []
+
+    def interrupt_the_third(cell, *arguments):
+        methods_asked.append(cell.method)
+        if len(methods_asked) == 3:
+            raise KeyboardInterrupt
+        return compiled(cell, *arguments)
+
+    monkeypatch.setattr(batch, "program", interrupt_the_third)
+    arguments = ["table1", "--seeds", 2, "--out", tmp_path]
+    assert call(arguments, tiny) == 130
+    assert "the same command continues" in capsys.readouterr().err
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / store.CELLS).iterdir()}
+    assert len(kept) == len(DOMAINS) * (3 + 2 * 2), "plans, and two methods' trainings"
+    assert not (tmp_path / "table1.md").exists()
+
+    assert call(arguments, tiny) == 0
+    assert methods_asked == [*METHODS[:3], *METHODS[2:]]
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    lines = lines_of(tmp_path / "table1.csv")
+    trained = [line for line in lines if line["method"] in METHODS]
+    assert all(np.isfinite(float(line["explicability_low"])) for line in trained)
+    assert all(np.isfinite(float(line["sampled_return"])) for line in trained)
+
+    assert call(["figure1", *arguments], tiny) == 0
+    assert len(methods_asked) == 5 + 1, "nothing is left to train"
+    columns = ("x", "y", "learned", "true")
+    heat = np.array([[float(line[name]) for name in columns] for line in lines_of(tmp_path / "figure1.csv")])
+    assert np.isfinite(heat).all()
