@@ -1,0 +1,235 @@
+"""The paper's driving study (Sec. 5.2) with synthetic participants: labels on a dry road, agents in the rain, ratings of them.
+
+    python -m peps_jax.study --seeds 10 --out results/study
+
+One group of participants compares pieces of scenes on a dry road, in none of which anybody crashes; a sanity check leaves out
+who prefers a collision. From their answers each method learns, and acts in the rain. Other participants then rate what was
+learned, from 1 to 10, by what they themselves believe and want. Nobody is told which method made a scene.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+import peps_envs
+from peps_envs import highway
+from peps_envs.highway.environment import HighwayParams, HighwayState, Ratings
+from peps_envs.highway.vehicle import IDLE, LANE_WIDTH, SLOWER
+from peps_jax import explicability, rollout
+from peps_jax.config import Config
+from peps_jax.parts import human, queries
+from peps_jax.parts.trajectory import Preferences, Segments
+from peps_jax.train import Result, train
+
+METHODS = ("peps", "sac", "drlhp", "policy_shaping")
+BEHAVIOURS = ("steers at once", "brakes, then steers", "stays in the lane")
+
+# A scene pays about 7, where a way through navigation's maze pays about 100: entropies weigh less, rewards needn't be scaled.
+SETTINGS = dict(
+    env="highway-rain", belief="both", lam=2.0, gamma=0.99, num_envs=16, rollout_length=24, warmup_steps=1_920,
+    hold_steps=2, reward_scale=1.0, policy_entropy_weight=0.02, initial_temperature=0.5, temperature=0.01,
+    segment_length=8, num_queries=2_000,
+)  # fmt: skip
+
+REGULAR = dict(env="highway-dry", belief="both")  # the condition in which preferences are gathered
+
+TRAINERS, ANSWERS = 15, 60  # participants who compare, and how many pairs each of them
+RATERS, SHOWN = 15, 3  # participants who rate, and scenes of each method that they see
+GROUPS = 100  # of raters, re-drawn
+CARELESS = 0.1  # share of participants who answer at random
+
+
+# --- participants ---------------------------------------------------------------------------------------------------------
+
+
+@struct.dataclass
+class Participants:
+    """What each believes, wants, and how reliably they answer; every leaf has a leading axis of participants."""
+
+    ratings: Ratings  # importance, 1 to 5
+    lane_change_cost: Array
+    swerve_cost: Array
+    dry_share: Array  # of the way from the road's true friction to a dry one's that is believed: 1 is the paper's bias
+    rationality: Array  # coefficient of Eq. (2), 0 of who answers at random
+
+
+def recruit(key: Array, number: int) -> Participants:
+    """`number` participants, scattered around the presets' human.
+
+    Importance is rated on a 5-point scale around the paper's means with a standard deviation of 0.8; costs are log-normal;
+    how dry the road is taken for is triangular on [0, 1] with its peak at 1.
+    """
+    key_ratings, key_costs, key_dry, key_rationality, key_careless = jax.random.split(key, 5)
+    task = peps_envs.make("highway-dry")
+    mean, want = jnp.stack(jax.tree.leaves(task.params.ratings)), task.beliefs["reward"]
+    scores = jnp.clip(mean[:, None] + 0.8 * jax.random.normal(key_ratings, (mean.shape[0], number)), 1.0, 5.0)
+    timidity = jnp.exp(0.3 * jax.random.normal(key_costs, (number,)))
+    careless = jax.random.bernoulli(key_careless, CARELESS, (number,))
+    rationality = 2.0 * jnp.exp(0.3 * jax.random.normal(key_rationality, (number,)))
+    return Participants(
+        ratings=jax.tree.unflatten(jax.tree.structure(task.params.ratings), list(scores)),
+        lane_change_cost=want.lane_change_cost * timidity,
+        swerve_cost=want.swerve_cost * timidity,
+        dry_share=jnp.sqrt(jax.random.uniform(key_dry, (number,))),
+        rationality=jnp.where(careless, 0.0, rationality),
+    )
+
+
+def mind(participant: Participants, params: HighwayParams) -> HighwayParams:
+    """The belief of one participant about the road `params`."""
+    dry, friction = peps_envs.make("highway-dry").params.physics.friction, params.physics.friction
+    believed = jax.tree.map(lambda true, dry: true + participant.dry_share * (dry - true), friction, dry)
+    return params.replace(
+        physics=params.physics.replace(friction=believed),
+        ratings=participant.ratings,
+        lane_change_cost=participant.lane_change_cost,
+        swerve_cost=participant.swerve_cost,
+    )
+
+
+def answers(key: Array, participants: Participants, segments: Segments, config: Config) -> Preferences:
+    """Each participant's answers to pairs of their own: rows (participants, pairs, ...) of segments and answers."""
+    _, params, _ = config.task()
+
+    def one(key: Array, participant: Participants, segments: Segments) -> Preferences:
+        own = config.replace(belief=mind(participant, params), rationality=participant.rationality)
+        return human.answer(key, segments, own)
+
+    return jax.vmap(one)(jax.random.split(key, participants.rationality.shape[0]), participants, segments)
+
+
+def attentive(key: Array, participants: Participants) -> Array:
+    """(participants,) bool: the sanity check, on a dry road. Who prefers a collision to braking before it fails."""
+    config = Config(**REGULAR)
+    pair = jax.tree.map(
+        lambda *rows: jnp.stack(rows, 1),
+        *(watch(lambda observation, key, time: jnp.full(1, action), config, key, 1) for action in (SLOWER, IDLE)),
+    )
+    number = participants.rationality.shape[0]
+    shown = jax.tree.map(lambda rows: jnp.broadcast_to(rows, (number, *rows.shape)), pair)
+    return answers(key, participants, shown, config).answers[:, 0] == 1.0
+
+
+# --- scenes ---------------------------------------------------------------------------------------------------------------
+
+
+def watch(act: Callable[[Array, Array, Array], Array], config: Config, key: Array, number: int) -> Segments:
+    """`number` scenes of `config`'s world, whole: (number, horizon, ...), masked after a crash. `act` as in `rollout.collect`."""
+    environment, _, _ = config.task()
+    config = config.replace(num_envs=number, rollout_length=environment.horizon)
+    key_start, key_steps = jax.random.split(key)
+    _, trajectory, _ = rollout.collect(rollout.init(key_start, config), act, key_steps, config)
+    rows = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), trajectory)
+    over = rows.transition.terminated
+    return Segments(
+        observation=rows.transition.observation,
+        action=rows.transition.action,
+        mask=jnp.where(jnp.cumsum(over, 1) - over > 0, 0.0, 1.0),
+        state=rows.state,
+        next_state=rows.next_state,
+    )
+
+
+def watch_agent(result: Result, key: Array, number: int) -> Segments:
+    """`number` scenes of a trained agent, which acts by its policy's mode."""
+    return watch(lambda observation, key, time: result.policy()(observation, None)[0], result.config, key, number)
+
+
+def crashed(scenes: Segments) -> Array:
+    """(...,) bool: whether the ego crashes in what a scene, or a piece of one, shows."""
+    return jnp.any(scenes.next_state.vehicles.crashed[..., 0] & (scenes.mask > 0), -1)
+
+
+def behaviour(scenes: Segments) -> Array:
+    """(n,) place in `BEHAVIOURS` of each whole scene, by what can be seen: when it slows down by 2 m/s, and leaves its line by 0.5 m.
+
+    Braking that begins after the car has left its line doesn't make it one that brakes first.
+    """
+    ego = jax.tree.map(lambda rows: rows[..., 0], scenes.next_state.vehicles)
+    start = scenes.state.vehicles
+    first = lambda happens: jnp.where(jnp.any(happens, 1), jnp.argmax(happens, 1), happens.shape[1])
+    seen = scenes.mask > 0
+    slower = first((ego.speed < start.speed[:, :1, 0] - 2.0) & seen)
+    aside = first((jnp.abs(ego.y - start.y[:, :1, 0]) > 0.5) & seen)
+    leaves = jnp.any((jnp.abs(ego.y - start.y[:, :1, 0]) > LANE_WIDTH / 2) & seen, 1)
+    return jnp.where(leaves, jnp.where(slower < aside, 1, 0), 2)
+
+
+# --- the training group's answers -----------------------------------------------------------------------------------------
+
+
+def compare(key: Array) -> Preferences:
+    """What the training group says of pieces of scenes on the dry road: TRAINERS * ANSWERS pairs, in none a collision.
+
+    Meta-actions are random, each held for one to four steps. Who fails the sanity check doesn't count.
+    """
+    key_group, key_start, key_drive, key_pairs, key_answer, key_check = jax.random.split(key, 6)
+    number, drivers = TRAINERS * ANSWERS, jnp.arange(128)
+    config = Config(
+        **REGULAR, num_envs=128, rollout_length=24, total_steps=128 * 24, num_queries=number,
+        segment_length=SETTINGS["segment_length"],
+    )  # fmt: skip
+
+    def act(observation: Array, key: Array, time: Array) -> Array:
+        drawn = lambda driver: jax.random.fold_in(jax.random.fold_in(key_drive, driver), time // (1 + driver % 4))
+        return jax.vmap(lambda driver: jax.random.randint(drawn(driver), (), 0, 5))(drivers)
+
+    _, trajectory, _ = rollout.collect(rollout.init(key_start, config), act, key_drive, config)
+    candidates = queries.candidates(trajectory, key_pairs, config)
+    safe = jnp.argsort(jnp.any(crashed(candidates), -1), stable=True)[:number]
+    pairs = jax.tree.map(lambda rows: rows[safe].reshape(TRAINERS, ANSWERS, *rows.shape[1:]), candidates)
+    participants = recruit(key_group, TRAINERS)
+    given = answers(key_answer, participants, pairs, config)
+    counted = given.answered * attentive(key_check, participants)[:, None]
+    return jax.tree.map(lambda rows: rows.reshape(number, *rows.shape[2:]), given._replace(answered=counted))
+
+
+def teacher(given: Preferences) -> human.Teacher:
+    """Answers that were given beforehand: each query of a training is replaced by one of them, drawn at random."""
+
+    def answer(key: Array, segments: Segments, config: Config) -> Preferences:
+        number = given.answers.shape[0]
+        index = jax.random.randint(key, (segments.mask.shape[0],), 0, number)
+        return jax.tree.map(lambda rows: rows[index], given)
+
+    return human.Teacher(answer=answer)
+
+
+# --- ratings --------------------------------------------------------------------------------------------------------------
+
+
+def worth(participant: Participants, scenes: Segments, env: str) -> Array:
+    """(n,) explicability of `scenes` (n, horizon, ...) to one participant: sum r_H + sum (l_H - l_A) by their own belief."""
+    task = peps_envs.make(env)
+    score = lambda state, action, after: explicability.score(
+        task.environment, task.params, mind(participant, task.params), state, action, after
+    )
+    scores = jax.vmap(jax.vmap(score))(scenes.state, scenes.action, scenes.next_state)
+    return jnp.sum(scores.explicability * scenes.mask, -1)
+
+
+def rate(key: Array, participants: Participants, scenes: Segments, env: str) -> Array:
+    """(participants, n) ratings from 1 to 10 of `scenes` (n, horizon, ...), which each participant has seen all of.
+
+    rating_i = 1 + 9 mean_j sigmoid(rationality (E_i - E_j)): how often they would prefer the scene to another one that they
+    saw, by their own Eq. (2). On the form it gets noise of standard deviation 1 and is a whole number.
+    """
+
+    def one(key: Array, participant: Participants) -> Array:
+        value = worth(participant, scenes, env)
+        wins = jax.nn.sigmoid(participant.rationality * (value[:, None] - value[None]))
+        felt = 1 + 9 * jnp.mean(wins, 1) + jax.random.normal(key, value.shape)
+        return jnp.clip(jnp.round(felt), 1.0, 10.0)
+
+    return jax.lax.map(lambda row: one(*row), (jax.random.split(key, participants.rationality.shape[0]), participants))
