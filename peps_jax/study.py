@@ -37,17 +37,25 @@ BEHAVIOURS = ("steers at once", "brakes, then steers", "stays in the lane")
 
 # A scene pays about 7, where a way through navigation's maze pays about 100: entropies weigh less, rewards needn't be scaled.
 SETTINGS = dict(
-    env="highway-rain", belief="both", lam=2.0, gamma=0.99, num_envs=16, rollout_length=24, warmup_steps=1_920,
+    lam=2.0, gamma=0.99, num_envs=16, rollout_length=24, warmup_steps=1_920,
     hold_steps=2, reward_scale=1.0, policy_entropy_weight=0.02, initial_temperature=0.5, temperature=0.01,
     segment_length=8, num_queries=2_000,
 )  # fmt: skip
 
-REGULAR = dict(env="highway-dry", belief="both")  # the condition in which preferences are gathered
+ONSET = (0.0, 0.4)  # s, when the car in front begins to brake: nobody can count on it and brake before
 
 TRAINERS, ANSWERS = 15, 60  # participants who compare, and how many pairs each of them
 RATERS, SHOWN = 15, 3  # participants who rate, and scenes of each method that they see
 GROUPS = 100  # of raters, re-drawn
 CARELESS = 0.1  # share of participants who answer at random
+
+
+def road(name: str, **changes: Any) -> Config:
+    """A `Config` of "highway-dry", the regular condition, or "highway-rain", with the scene of the study on it."""
+    task = peps_envs.make(name)
+    onset = jnp.asarray(ONSET, jnp.result_type(float))
+    begin = lambda params: params.replace(scenario=params.scenario.replace(onset=onset))
+    return Config(env=name, params=begin(task.params), belief=begin(task.beliefs["both"]), **changes)
 
 
 # --- participants ---------------------------------------------------------------------------------------------------------
@@ -111,7 +119,7 @@ def answers(key: Array, participants: Participants, segments: Segments, config: 
 
 def attentive(key: Array, participants: Participants) -> Array:
     """(participants,) bool: the sanity check, on a dry road. Who prefers a collision to braking before it fails."""
-    config = Config(**REGULAR)
+    config = road("highway-dry")
     pair = jax.tree.map(
         lambda *rows: jnp.stack(rows, 1),
         *(watch(lambda observation, key, time: jnp.full(1, action), config, key, 1) for action in (SLOWER, IDLE)),
@@ -176,8 +184,8 @@ def compare(key: Array) -> Preferences:
     """
     key_group, key_start, key_drive, key_pairs, key_answer, key_check = jax.random.split(key, 6)
     number, drivers = TRAINERS * ANSWERS, jnp.arange(128)
-    config = Config(
-        **REGULAR, num_envs=128, rollout_length=24, total_steps=128 * 24, num_queries=number,
+    config = road(
+        "highway-dry", num_envs=128, rollout_length=24, total_steps=128 * 24, num_queries=number,
         segment_length=SETTINGS["segment_length"],
     )  # fmt: skip
 
@@ -209,17 +217,16 @@ def teacher(given: Preferences) -> human.Teacher:
 # --- ratings --------------------------------------------------------------------------------------------------------------
 
 
-def worth(participant: Participants, scenes: Segments, env: str) -> Array:
+def worth(participant: Participants, scenes: Segments, config: Config) -> Array:
     """(n,) explicability of `scenes` (n, horizon, ...) to one participant: sum r_H + sum (l_H - l_A) by their own belief."""
-    task = peps_envs.make(env)
-    score = lambda state, action, after: explicability.score(
-        task.environment, task.params, mind(participant, task.params), state, action, after
-    )
+    environment, params, _ = config.task()
+    belief = mind(participant, params)
+    score = lambda *transition: explicability.score(environment, params, belief, *transition)
     scores = jax.vmap(jax.vmap(score))(scenes.state, scenes.action, scenes.next_state)
     return jnp.sum(scores.explicability * scenes.mask, -1)
 
 
-def rate(key: Array, participants: Participants, scenes: Segments, env: str) -> Array:
+def rate(key: Array, participants: Participants, scenes: Segments, config: Config) -> Array:
     """(participants, n) ratings from 1 to 10 of `scenes` (n, horizon, ...), which each participant has seen all of.
 
     rating_i = 1 + 9 mean_j sigmoid(rationality (E_i - E_j)): how often they would prefer the scene to another one that they
@@ -227,7 +234,7 @@ def rate(key: Array, participants: Participants, scenes: Segments, env: str) -> 
     """
 
     def one(key: Array, participant: Participants) -> Array:
-        value = worth(participant, scenes, env)
+        value = worth(participant, scenes, config)
         wins = jax.nn.sigmoid(participant.rationality * (value[:, None] - value[None]))
         felt = 1 + 9 * jnp.mean(wins, 1) + jax.random.normal(key, value.shape)
         return jnp.clip(jnp.round(felt), 1.0, 10.0)
