@@ -60,7 +60,9 @@ class Config:
     hold_steps: int = _static(5, "steps for which such an action is held", group="run")
 
     learning_rate: Any = _traced(1e-3, "Adam's rate for policy and critics", group="sac")
-    fade_share: Any = _traced(0.3, "share of the rounds, at the end, over which that rate falls to a tenth", group="sac")
+    fade_share: Any = _traced(
+        0.3, "share of the rounds, at the end, over which that rate falls to a tenth", group="sac"
+    )
     temperature: Any = _traced(
         0.02, "weight of the policy entropy beside Eq. (6)'s, at the end (in reward units)", group="sac"
     )

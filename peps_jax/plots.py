@@ -47,7 +47,7 @@ FIRM = 0.5  # gain on sand from which it is drawn as in the paper's D4, darker: 
 DIRECTIONS = 16  # of full steps, over which the heat maps take the mean
 
 
-def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Figure, np.ndarray]:
+def panels(rows: int, columns: int, width: float, height: float) -> tuple[Figure, np.ndarray]:
     """A figure of panels `width` x `height` inches. Without pyplot: no display is asked for, and nothing is global."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -105,10 +105,10 @@ def learning_curves(rows: Sequence[Row]) -> Figure | None:
     if not rows:
         return None
     envs, lam = _values(rows, lambda row: row.cell.env), _middle_lam(rows)
-    figure, panels = _figure(2, len(envs), 3.6, 2.3)
+    figure, grid = panels(2, len(envs), 3.6, 2.3)
     for column, env in enumerate(envs):
         for line, (curve, title) in enumerate((("return_", "return"), ("explicability", "explicability"))):
-            axes = panels[line, column]
+            axes = grid[line, column]
             _tidy(axes)
             shown = []
             for method in _values(rows, lambda row: row.cell.method):
@@ -127,7 +127,7 @@ def learning_curves(rows: Sequence[Row]) -> Figure | None:
                 axes.set_xlabel("environment steps (thousands)", color=INK, fontsize=9)
             if column == 0:
                 axes.set_ylabel(title, color=INK, fontsize=9)
-    panels[0, 0].legend(frameon=False, fontsize=8, loc="lower right")
+    grid[0, 0].legend(frameon=False, fontsize=8, loc="lower right")
     return figure
 
 
@@ -155,8 +155,8 @@ def frontier(rows: Sequence[Row]) -> Figure | None:
     if not rows:
         return None
     envs = _values(rows, lambda row: row.cell.env)
-    figure, panels = _figure(1, len(envs), 3.6, 3.1)
-    for axes, env in zip(panels[0], envs, strict=True):
+    figure, grid = panels(1, len(envs), 3.6, 3.1)
+    for axes, env in zip(grid[0], envs, strict=True):
         _tidy(axes)
         for method in _values(rows, lambda row: row.cell.method):
             lams = _values(
@@ -168,8 +168,8 @@ def frontier(rows: Sequence[Row]) -> Figure | None:
         axes.margins(0.15)
         axes.set_title(env, color=INK, fontsize=11)
         axes.set_xlabel("return", color=INK, fontsize=9)
-    panels[0, 0].set_ylabel("explicability", color=INK, fontsize=9)
-    panels[0, 0].legend(frameon=False, fontsize=8)
+    grid[0, 0].set_ylabel("explicability", color=INK, fontsize=9)
+    grid[0, 0].legend(frameon=False, fontsize=8)
     return figure
 
 
@@ -239,11 +239,11 @@ def routes(rows: Sequence[Row], episodes: int = 3) -> Figure | None:
         return None
     variant = lambda row: (row.cell.method, row.cell.lam if methods.get(row.cell.method).uses_lam else None)
     variants, envs = _values(rows, variant), _values(rows, lambda row: row.cell.env)
-    figure, panels = _figure(len(envs), len(variants), 2.5, 2.5)
+    figure, grid = panels(len(envs), len(variants), 2.5, 2.5)
     for line, env in enumerate(envs):
         for column, (method, lam) in enumerate(variants):
             members = {row.cell.training: row for row in rows if row.cell.env == env and variant(row) == (method, lam)}
-            axes = panels[line, column]
+            axes = grid[line, column]
             if not members:
                 axes.set_axis_off()
                 continue
@@ -327,16 +327,16 @@ def surrogate_maps(rows: Sequence[Row]) -> Figure | None:
     for row in rows:
         if row.cell.lam == lam:
             first.setdefault((row.cell.env, row.cell.method), row)
-    figure, panels = _figure(len(first), 2, 3.3, 2.75)
+    figure, grid = panels(len(first), 2, 3.3, 2.75)
     for line, ((env, method), row) in enumerate(first.items()):
         learned, true, free = surrogate_values(row.finished.result)
         params = row.finished.result.config.task()[1]
         agreement = _rank_correlation(learned[free], true[free])
         titles = (f"learned r̂  (rank correlation {agreement:.2f})", "true ℓ_H + r_H")
-        for axes, values, title in zip(panels[line], (learned, true), titles, strict=True):
+        for axes, values, title in zip(grid[line], (learned, true), titles, strict=True):
             _heat(figure, axes, np.where(free, values, np.nan), params)
             axes.set_title(title, color=INK, fontsize=9)
-        panels[line, 0].set_ylabel(f"{env}, {method}, seed {row.cell.seed}", color=INK, fontsize=9)
+        grid[line, 0].set_ylabel(f"{env}, {method}, seed {row.cell.seed}", color=INK, fontsize=9)
     return figure
 
 

@@ -240,3 +240,166 @@ def rate(key: Array, participants: Participants, scenes: Segments, config: Confi
         return jnp.clip(jnp.round(felt), 1.0, 10.0)
 
     return jax.lax.map(lambda row: one(*row), (jax.random.split(key, participants.rationality.shape[0]), participants))
+
+
+class Group(NamedTuple):
+    """What one group of raters said."""
+
+    mean: dict[str, float]  # by method, over raters
+    sd: dict[str, float]
+    p: float  # of a one-way ANOVA over the raters' means
+    eta_squared: float  # share of the variance that lies between methods
+
+
+def analyse(ratings: dict[str, np.ndarray]) -> Group:
+    """One-way ANOVA of each rater's mean rating, (raters,) for each method."""
+    from scipy import stats
+
+    values = list(ratings.values())
+    together = np.concatenate(values)
+    between = sum(len(one) * (np.mean(one) - np.mean(together)) ** 2 for one in values)
+    return Group(
+        mean={method: float(np.mean(one)) for method, one in ratings.items()},
+        sd={method: float(np.std(one, ddof=1)) for method, one in ratings.items()},
+        p=float(stats.f_oneway(*values).pvalue),
+        eta_squared=float(between / np.sum((together - np.mean(together)) ** 2)),
+    )
+
+
+def groups(key: Array, scenes: dict[str, Segments], config: Config, number: int = GROUPS) -> list[Group]:
+    """`number` re-drawn groups of RATERS who passed the sanity check; each is shown SHOWN scenes of each method, drawn anew."""
+    together = jax.tree.map(lambda *rows: jnp.stack(rows), *scenes.values())  # (methods, n, horizon, ...)
+    methods, pool = together.mask.shape[:2]
+
+    def one(key: Array) -> tuple[Array, Array]:
+        key_recruit, key_check, key_show, key_rate = jax.random.split(key, 4)
+        volunteers = recruit(key_recruit, 2 * RATERS)
+        failed = ~attentive(key_check, volunteers)
+        order = jnp.argsort(failed, stable=True)[:RATERS]
+        raters = jax.tree.map(lambda rows: rows[order], volunteers)
+        shown = jax.random.randint(key_show, (methods, SHOWN), 0, pool)
+        drawn = jax.tree.map(lambda rows: jax.vmap(lambda row, which: row[which])(rows, shown), together)
+        flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), drawn)
+        return rate(key_rate, raters, flat, config).reshape(RATERS, methods, SHOWN).mean(-1)
+
+    ratings = np.asarray(jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(key, number)))
+    return [analyse(dict(zip(scenes, group.T, strict=True))) for group in ratings]
+
+
+# --- the study ------------------------------------------------------------------------------------------------------------
+
+
+class Findings(NamedTuple):
+    """What the study found."""
+
+    scenes: dict[str, Segments]  # by method: (seeds * episodes, horizon, ...)
+    behaviour: dict[str, list[list[float]]]  # by method and seed: the share of scenes with each of `BEHAVIOURS`
+    crash_rate: dict[str, list[float]]  # by method and seed
+    groups: list[Group]  # of raters; the first is the study's own
+
+    def summary(self) -> dict[str, Any]:
+        """As JSON knows it."""
+        highest = [max(group.mean, key=group.mean.get) == "peps" for group in self.groups]
+        significant = [group.p < 0.05 for group in self.groups]
+        share = lambda flags: float(np.mean(flags))
+        return {
+            "behaviours": BEHAVIOURS,
+            "behaviour": self.behaviour,
+            "crash_rate": self.crash_rate,
+            "ratings": self.groups[0]._asdict(),
+            "groups": len(self.groups),
+            "peps_highest": share(highest),
+            "significant": share(significant),
+            "peps_highest_and_significant": share(np.logical_and(highest, significant)),
+        }
+
+
+def learn(method: str, seeds: Sequence[int], steps: int, episodes: int) -> Segments:
+    """`episodes` scenes in the rain of an agent for each seed, each taught by a group of its own: (seeds, episodes, horizon, ...)."""
+
+    def one(seed: Array) -> Segments:
+        config = road("highway-rain", method=method, total_steps=steps, **SETTINGS).replace(seed=seed)
+        key_group, key_watch = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1))
+        return watch_agent(train(config, teacher(compare(key_group))), key_watch, episodes)
+
+    return jax.jit(lambda seeds: jax.lax.map(one, seeds))(jnp.asarray(seeds))
+
+
+def run(
+    seeds: Sequence[int],
+    steps: int = 20_000,
+    episodes: int = 100,
+    methods: Sequence[str] = METHODS,
+    number: int = GROUPS,
+) -> Findings:
+    """The whole study: labels, agents, and `number` groups of raters."""
+    scenes, behaviours, crashes = {}, {}, {}
+    for method in methods:
+        print(f"training {method}, {len(seeds)} seeds", file=sys.stderr, flush=True)
+        learned = learn(method, seeds, steps, episodes)
+        kinds = np.asarray(jax.vmap(behaviour)(learned))
+        behaviours[method] = [[float(np.mean(row == kind)) for kind in range(len(BEHAVIOURS))] for row in kinds]
+        crashes[method] = np.mean(np.asarray(crashed(learned)), 1).tolist()
+        scenes[method] = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), learned)
+    print(f"{number} groups of raters", file=sys.stderr, flush=True)
+    rated = groups(jax.random.fold_in(jax.random.key(seeds[0]), 2), scenes, road("highway-rain"), number)
+    return Findings(scenes, behaviours, crashes, rated)
+
+
+def figure3(
+    out: str | Path, seeds: Sequence[int] = range(10), steps: int = 20_000, methods: Sequence[str] = METHODS
+) -> dict[str, Any]:
+    """Runs the study and writes figure3.png, figure3.gif and study.json into `out`; returns what study.json holds."""
+    from peps_jax import film
+
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    findings = run(seeds, steps, methods=methods)
+    summary = findings.summary()
+    rated = findings.groups[0]
+    shown = {
+        f"{method} (μ = {rated.mean[method]:.1f}, σ = {rated.sd[method]:.1f})": typical(scenes)
+        for method, scenes in findings.scenes.items()
+    }
+    film.strips(shown, f"one-way ANOVA: p = {rated.p:.2g}").savefig(out / "figure3.png", dpi=150)
+    film.animate(shown, out / "figure3.gif")
+    (out / "study.json").write_text(json.dumps(summary, indent=1) + "\n")
+    return summary
+
+
+def typical(scenes: Segments) -> Segments:
+    """The first of `scenes` (n, horizon, ...) that behaves as most of them do: (horizon, ...)."""
+    kinds = np.asarray(behaviour(scenes))
+    most = np.bincount(kinds, minlength=len(BEHAVIOURS)).argmax()
+    return jax.tree.map(lambda rows: rows[int(np.argmax(kinds == most))], scenes)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m peps_jax.study", description="The paper's driving study, simulated."
+    )
+    parser.add_argument("--out", default="results/study", help="folder to write [results/study]")
+    parser.add_argument(
+        "--seeds", type=int, default=10, help="agents of each method, each with trainers of its own [10]"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="the first of them [0]")
+    parser.add_argument("--steps", type=int, default=20_000, help="environment steps of a training [20000]")
+    values = parser.parse_args(arguments)
+    if min(values.seeds, values.steps) < 1 or values.seed < 0:
+        parser.error("seeds and steps are whole numbers from 1 on, seed from 0 on")
+    summary = figure3(values.out, range(values.seed, values.seed + values.seeds), values.steps)
+    for method, shares in summary["behaviour"].items():
+        kinds = ", ".join(f"{kind} {share:.0%}" for kind, share in zip(BEHAVIOURS, np.mean(shares, 0), strict=True))
+        rated = f"rated {summary['ratings']['mean'][method]:.1f} ± {summary['ratings']['sd'][method]:.1f}"
+        print(f"{method}: {kinds}; crashes {np.mean(summary['crash_rate'][method]):.0%}; {rated}")
+    print(
+        f"p = {summary['ratings']['p']:.2g}, eta squared {summary['ratings']['eta_squared']:.2f}; of {summary['groups']} groups "
+        f"{summary['peps_highest_and_significant']:.0%} rate PEPS highest with p < 0.05"
+    )
+    print(f"in {values.out}: figure3.png, figure3.gif, study.json")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -29,7 +29,7 @@ LAYERS = (
     {"peps_jax.methods"},
     {f"peps_jax.{name}" for name in ("explicability", "rollout", "train")},
     {f"peps_jax.{name}" for name in ("evaluate", "planner", "statistics")},
-    {f"peps_jax.{name}" for name in ("batch", "results", "plots", "sweep", "reproduce")},
+    {f"peps_jax.{name}" for name in ("batch", "results", "plots", "sweep", "film", "study", "reproduce")},
 )
 LAYER_OF = {module: layer for layer, modules in enumerate(LAYERS) for module in modules}
 STRANGERS = next(layer for layer in LAYERS if "peps_jax.parts.sac" in layer)  # parts that know nothing of one another
