@@ -23,8 +23,7 @@ from flax import struct
 from jax import Array
 
 import peps_envs
-from peps_envs import highway
-from peps_envs.highway.environment import HighwayParams, HighwayState, Ratings
+from peps_envs.highway.environment import HighwayParams, Ratings
 from peps_envs.highway.vehicle import IDLE, LANE_WIDTH, SLOWER
 from peps_jax import explicability, rollout
 from peps_jax.config import Config
@@ -120,10 +119,8 @@ def answers(key: Array, participants: Participants, segments: Segments, config: 
 def attentive(key: Array, participants: Participants) -> Array:
     """(participants,) bool: the sanity check, on a dry road. Who prefers a collision to braking before it fails."""
     config = road("highway-dry")
-    pair = jax.tree.map(
-        lambda *rows: jnp.stack(rows, 1),
-        *(watch(lambda observation, key, time: jnp.full(1, action), config, key, 1) for action in (SLOWER, IDLE)),
-    )
+    plans = [lambda observation, key, time, action=action: jnp.full(1, action) for action in (SLOWER, IDLE)]
+    pair = jax.tree.map(lambda *rows: jnp.stack(rows, 1), *(watch(plan, config, key, 1) for plan in plans))
     number = participants.rationality.shape[0]
     shown = jax.tree.map(lambda rows: jnp.broadcast_to(rows, (number, *rows.shape)), pair)
     return answers(key, participants, shown, config).answers[:, 0] == 1.0
@@ -160,9 +157,9 @@ def crashed(scenes: Segments) -> Array:
 
 
 def behaviour(scenes: Segments) -> Array:
-    """(n,) place in `BEHAVIOURS` of each whole scene, by what can be seen: when it slows down by 2 m/s, and leaves its line by 0.5 m.
+    """(n,) place in `BEHAVIOURS` of each whole scene, by what can be seen: whether it changes lane, and what came before.
 
-    Braking that begins after the car has left its line doesn't make it one that brakes first.
+    It brakes when it is 2 m/s slower than at the start, and steers when it is 0.5 m off its line, after a policy step each.
     """
     ego = jax.tree.map(lambda rows: rows[..., 0], scenes.next_state.vehicles)
     start = scenes.state.vehicles
@@ -315,7 +312,7 @@ class Findings(NamedTuple):
 
 
 def learn(method: str, seeds: Sequence[int], steps: int, episodes: int) -> Segments:
-    """`episodes` scenes in the rain of an agent for each seed, each taught by a group of its own: (seeds, episodes, horizon, ...)."""
+    """Scenes in the rain of an agent for each seed, each taught by a group of its own: (seeds, episodes, horizon, ...)."""
 
     def one(seed: Array) -> Segments:
         config = road("highway-rain", method=method, total_steps=steps, **SETTINGS).replace(seed=seed)
