@@ -295,7 +295,10 @@ def print_table(rows: Sequence[Row]) -> None:
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
     for name in ("env", "method", "lambda"):
         table.add_column(name)
-    for name in ("return", "explicability", "goal", "pit", "seeds"):
+    records_of = {row.cell.training: results.record(row) for row in rows}
+    rates = list(dict.fromkeys(name for record in records_of.values() for name in record if name.endswith("_rate")))
+    events = (name.removesuffix("_rate").replace("_", " ") for name in rates)
+    for name in ("return", "explicability", *events, "seeds"):
         table.add_column(name, justify="right", no_wrap=True)
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
@@ -303,11 +306,11 @@ def print_table(rows: Sequence[Row]) -> None:
         groups.setdefault((row.cell.env, row.cell.method, lam), []).append(row)
     for key, members in groups.items():
         trainings = {row.cell.training: row for row in members}.values()
-        records = [results.record(row) for row in trainings if not row.finished.failed]
+        records = [records_of[row.cell.training] for row in trainings if not row.finished.failed]
         failed = len(trainings) - len(records)
         seeds = f"{len(records)}" + (f", {failed} failed" if failed else "")
         figures = (_spread(records, name) for name in ("return_mean", "explicability_mean"))
-        table.add_row(*key, *figures, _rate(records, "goal_rate"), _rate(records, "pit_rate"), seeds)
+        table.add_row(*key, *figures, *(_rate(records, name) for name in rates), seeds)
     Console(width=None if sys.stdout.isatty() else 120).print(table)
 
 

@@ -210,7 +210,8 @@ def episodes(keys, plan, params):
 
         start = (WORLD.reset(key_reset, params)[0], jnp.ones((), bool))
         _, (steps, alive) = jax.lax.scan(step, start, (plan, jax.random.split(key_steps, len(plan))))
-        return jnp.sum(steps.reward * alive), jnp.any(steps.terminated & alive), steps
+        crashed = interface.event(WORLD, steps.events, "crashed")
+        return jnp.sum(steps.reward * alive), jnp.any(crashed & alive), steps
 
     return jax.vmap(episode)(keys)
 
@@ -264,11 +265,11 @@ def test_an_episode_ends_in_one_way_only(seed, plan, name):
     _, crashed, steps = episodes(jax.random.key(seed)[None], jnp.array(plan), TASKS[name].params)
     for leaf in jax.tree.leaves((steps.observation, steps.reward, steps.state.vehicles)):
         assert np.all(np.isfinite(leaf))
-    assert not np.any(steps.terminated & steps.truncated)
-    np.testing.assert_array_equal(interface.event(WORLD, steps.events, "crashed"), steps.terminated)
-    assert bool(crashed[0]) == bool(steps.terminated.any())
+    assert not np.any(steps.truncated)
+    wrecked = interface.event(WORLD, steps.events, "crashed")
+    np.testing.assert_array_equal(steps.terminated, wrecked | (np.arange(8) >= 7)[None])
+    assert bool(crashed[0]) == bool(wrecked.any())
     if not crashed[0]:
-        np.testing.assert_array_equal(steps.truncated[0], np.arange(8) == 7)
         assert np.all((steps.reward >= 0) & (steps.reward <= 1))
     sideways = np.asarray(interface.event(WORLD, steps.events, "changed_lane")).sum()
     assert sideways == 0 or {LANE_LEFT, LANE_RIGHT} & set(plan.tolist())
@@ -324,6 +325,16 @@ def test_the_reward_weighs_features_by_their_ratings():
     assert WORLD.reward(state, IDLE, after, params) == pytest.approx(0.25 * 0.5 + 0.75 * 0.5, rel=1e-5)
     wreck = after.replace(vehicles=vehicles.replace(crashed=jnp.array([True, True])))
     assert WORLD.reward(state, IDLE, wreck, params) == pytest.approx(0.5 - 10, rel=1e-5)
+
+
+def test_moving_sideways_costs_the_more_the_faster():
+    params = highway.make_params(lane_change_cost=1.0, swerve_cost=4.0)
+    state, _ = reset(jax.random.key(0), params)
+    after = state.replace(vehicles=state.vehicles.replace(y=jnp.array([3.0, 4.0])))
+    for speed in (0.0, 15.0, 25.0):
+        before = state.replace(vehicles=state.vehicles.replace(speed=jnp.array([speed, 25.0])))
+        change = WORLD.reward(before, IDLE, after, params) - WORLD.reward(before, IDLE, after, highway.make_params())
+        assert change == pytest.approx(-(1 + 4 * (speed / 30) ** 2) / 4, rel=1e-4)
 
 
 # The next state
@@ -434,7 +445,10 @@ def test_braking_in_the_rain_surprises_a_human_who_believes_the_road_dry():
         jax.vmap(lambda outcome, mind: distribution(state, SLOWER, mind).relative_log_prob(outcome), (0, None))
     )
     biased, unbiased = (score(outcomes, task.beliefs[mind]).mean() for mind in ("biased", "unbiased"))
-    assert biased < unbiased - 0.3
+    assert biased < unbiased - 0.05
+    wide = lambda mind: mind.replace(perception_width=jnp.array([1.0, 0.3, 1.0]))
+    sharp = [score(outcomes, wide(task.beliefs[mind])).mean() for mind in ("biased", "unbiased")]
+    assert sharp[0] < sharp[1] - 0.3, "the more so the better one tells speeds apart"
 
 
 # Presets and transforms
@@ -448,7 +462,7 @@ def test_the_presets():
         friction = lambda params: (float(params.physics.friction.mean), float(params.physics.friction.sd))
         assert friction(task.beliefs["biased"]) == friction(TASKS["dry"].params)
         chex.assert_trees_all_equal(task.beliefs["unbiased"], task.params)
-        assert task.beliefs["reward"].ratings.distance > task.params.ratings.distance
+        assert task.beliefs["reward"].swerve_cost > task.params.swerve_cost == 0
         assert friction(task.beliefs["reward"]) == friction(TASKS[name].params)
 
 

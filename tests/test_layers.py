@@ -29,7 +29,7 @@ LAYERS = (
     {"peps_jax.methods"},
     {f"peps_jax.{name}" for name in ("explicability", "rollout", "train")},
     {f"peps_jax.{name}" for name in ("evaluate", "planner", "statistics")},
-    {f"peps_jax.{name}" for name in ("batch", "results", "plots", "sweep")},
+    {f"peps_jax.{name}" for name in ("batch", "results", "plots", "sweep", "film", "study")},
     {"peps_jax.reproduce.store"},
     {"peps_jax.reproduce.study"},
     {"peps_jax.reproduce.tables"},

@@ -2,7 +2,8 @@
 
 Two lanes. The ego follows a car in the right lane (1) at equal speed, which begins to brake at a random time and stands in the
 end; the left lane (0) is free, or has traffic in it. Every second the ego chooses one of highway-env's five meta-actions.
-The only randomness after the start is the road's friction mu, drawn anew for every policy step.
+The only randomness after the start is the road's friction mu, drawn anew for every policy step. The scene is over after
+`horizon` steps: what it is worth is a sum over it, the observation has the time, and so its end terminates it.
 
 The true domain and the human's belief are two values of `HighwayParams`: a human who thinks that one brakes in the rain as
 effectively as in the dry holds the dry road's friction for true.
@@ -63,6 +64,8 @@ class HighwayParams:
     scenario: Scenario
     ratings: Ratings
     crash_reward: Array
+    lane_change_cost: Array  # of a whole lane change, at any speed
+    swerve_cost: Array  # of a whole lane change at `full_speed`, beside that; it grows with the speed squared
     full_speed: Array  # m/s, from which on driving faster is worth no more
     far: Array  # m, from which on a car in front or beside doesn't matter
     perception_width: Array  # (3,) sigma_p of gap (m), lateral position (m) and speed (m/s)
@@ -207,8 +210,8 @@ class Highway(Environment):
             state=next_state,
             observation=self.observe(next_state),
             reward=self.reward(state, action, next_state, params),
-            terminated=crashed,
-            truncated=(next_state.time >= self.horizon) & ~crashed,
+            terminated=crashed | (next_state.time >= self.horizon),
+            truncated=jnp.zeros((), bool),
             events=jnp.stack([crashed, before != after]),
         )
 
@@ -243,11 +246,21 @@ class Highway(Environment):
         )
 
     def reward(self, state: HighwayState, action: Array, next_state: HighwayState, params: HighwayParams) -> Array:
-        """sum_i w_i f_i / sum_i w_i, less for a crash; at most 1 a step."""
+        """sum_i w_i f_i / sum_i w_i, less for a crash and for moving sideways; at most 1 a step.
+
+        Moving by dy costs (lane_change_cost + swerve_cost (v / full_speed)^2) |dy| / LANE_WIDTH, with v before the step: what
+        it takes from the tyres, and from who watches, grows with the speed squared.
+        """
         del action  # what counts is where it led
         features, ratings = self.rate(state, next_state, params), params.ratings
         weights = jnp.stack([ratings.speed, ratings.distance, ratings.relative_speed, ratings.lane])
-        return jnp.stack(features) @ weights / jnp.sum(weights) + params.crash_reward * next_state.vehicles.crashed[0]
+        sideways = jnp.abs(next_state.vehicles.y[0] - state.vehicles.y[0]) / LANE_WIDTH
+        haste = (state.vehicles.speed[0] / params.full_speed) ** 2
+        return (
+            jnp.stack(features) @ weights / jnp.sum(weights)
+            + params.crash_reward * next_state.vehicles.crashed[0]
+            - (params.lane_change_cost + params.swerve_cost * haste) * sideways
+        )
 
     def next_state_distribution(self, state: HighwayState, action: Array, params: HighwayParams) -> HighwayNextState:
         friction = params.physics.friction
