@@ -37,13 +37,13 @@ BEHAVIOURS = ("steers at once", "brakes, then steers", "stays in the lane")
 # A scene pays about 7, where a way through navigation's maze pays about 100: entropies weigh less, rewards needn't be scaled.
 SETTINGS = dict(
     lam=2.0, gamma=0.99, num_envs=16, rollout_length=24, warmup_steps=1_920,
-    hold_steps=2, reward_scale=1.0, policy_entropy_weight=0.02, initial_temperature=0.5, temperature=0.01,
-    segment_length=8, num_queries=2_000,
+    hold_steps=2, reward_scale=1.0, policy_entropy_weight=0.02, initial_temperature=2.0, temperature=0.01,
+    segment_length=8, num_queries=4_000,
 )  # fmt: skip
 
 ONSET = (0.0, 0.4)  # s, when the car in front begins to brake: nobody can count on it and brake before
 
-TRAINERS, ANSWERS = 15, 60  # participants who compare, and how many pairs each of them
+TRAINERS, ANSWERS = 15, 200  # participants who compare, and how many pairs each of them
 RATERS, SHOWN = 15, 3  # participants who rate, and scenes of each method that they see
 GROUPS = 100  # of raters, re-drawn
 CARELESS = 0.1  # share of participants who answer at random
