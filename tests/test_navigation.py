@@ -230,7 +230,7 @@ def test_quadrature_has_the_samples_mean_and_variance(params, position, action):
     _, moved = sampled(jax.random.key(1), position, action, params)
     # a clipped Gaussian is not a polynomial: some percent are all that even 80 nodes promise at a wall
     np.testing.assert_allclose(mean, np.mean(moved, 0), atol=0.03)
-    np.testing.assert_allclose(variance, np.var(moved, 0), rtol=0.08, atol=1e-4)
+    np.testing.assert_allclose(variance, np.var(moved, 0), rtol=0.1, atol=1e-4)
 
 
 def test_quadrature_is_exact_without_walls():
