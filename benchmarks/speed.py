@@ -9,18 +9,15 @@ PEPS's rate is also given as a share of SAC's in the same run, and its time and 
 from __future__ import annotations
 
 import argparse
-import os
 import pathlib
 import time
 from typing import NamedTuple
 
-os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={len(os.sched_getaffinity(0))}")
-
 import jax
-import numpy as np
-from jax.sharding import NamedSharding, PartitionSpec
+from cells import compile_over_devices
 
-from peps_jax import Config, grid, train
+from peps_jax import Config, train
+from peps_jax.sweep import use_every_core
 
 FOLDER = pathlib.Path(__file__).parent / "results"
 
@@ -36,13 +33,8 @@ class Cost(NamedTuple):
 
 def cost(config: Config, cells: int) -> Cost:
     """Trains `cells` seeds."""
-    mesh, spec = jax.make_mesh((jax.device_count(),), ("cells",)), PartitionSpec("cells")
-    batch = jax.device_put(grid(config, seed=np.arange(cells)), NamedSharding(mesh, spec))
-    body = lambda batch: jax.lax.map(train, batch)
     start = time.perf_counter()
-    program = (
-        jax.jit(jax.shard_map(body, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)).lower(batch).compile()
-    )
+    program, batch = compile_over_devices(train, [config.replace(seed=seed) for seed in range(cells)])
     compiled = time.perf_counter()
     jax.block_until_ready(program(batch))
     seconds = time.perf_counter() - compiled
@@ -59,6 +51,7 @@ def main() -> None:
     )
     parser.add_argument("--steps", type=int, default=12_000, help="environment steps of a training")
     arguments = parser.parse_args()
+    use_every_core()
     lines = ["| training | hidden layers | environment steps a second | compilation, s |", "|---|---|---|---|"]
     rates = {}
     for method, width, steps in (

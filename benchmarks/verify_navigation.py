@@ -9,25 +9,21 @@ episodes with the policy's mode, and the same with samples beside it.
 from __future__ import annotations
 
 import argparse
-import functools
 import json
-import os
 import pathlib
 import time
-
-os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={len(os.sched_getaffinity(0))}")
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import NamedSharding, PartitionSpec
+from cells import compile_over_devices
 from scipy import stats
 
 import peps_envs
 from peps_envs.navigation import NavigationState
-from peps_jax import Config, batch, evaluate, planner
-from peps_jax.evaluate import Evaluation, evaluate_policy
+from peps_jax import Config, evaluate, planner
 from peps_jax.parts import human, surrogate
+from peps_jax.sweep import use_every_core
 from peps_jax.train import finish, init, run_rounds
 
 DOMAINS = ("nav-d1", "nav-d2", "nav-d3", "nav-d4")
@@ -85,15 +81,10 @@ def measure(config: Config) -> dict[str, jax.Array]:
 
 def run_cells(configs: list[Config]) -> dict[str, np.ndarray]:
     """`measure` for each cell, spread over the devices, one at a time on each."""
-    mesh, spec = jax.make_mesh((jax.device_count(),), ("cells",)), PartitionSpec("cells")
-    number = len(configs)
-    padded = [*configs, *[configs[-1]] * (-number % jax.device_count())]
-    cells = jax.device_put(batch.stack(padded), NamedSharding(mesh, spec))
-    body = lambda cells: jax.lax.map(measure, cells)
-    program = jax.jit(jax.shard_map(body, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
     start = time.perf_counter()
-    figures = jax.tree.map(lambda values: np.asarray(values)[:number], program(cells))
-    print(f"  {number} trainings, {time.perf_counter() - start:.0f} s with compilation", flush=True)
+    program, cells = compile_over_devices(measure, configs)
+    figures = jax.tree.map(lambda values: np.asarray(values)[: len(configs)], program(cells))
+    print(f"  {len(configs)} trainings, {time.perf_counter() - start:.0f} s with compilation", flush=True)
     return figures
 
 
@@ -103,17 +94,13 @@ def interval(values: np.ndarray) -> tuple[float, float]:
     return tuple(np.percentile(draws, [2.5, 97.5]))
 
 
-@functools.partial(jax.jit, static_argnames=("environment", "objective"))
-def planned_episodes(environment, params, belief, lam, objective: str) -> Evaluation:
-    """Episodes of the exact planner."""
-    plan = planner.solve(params, belief, objective, lam)
-    return evaluate_policy(plan.policy, environment, params, belief, jax.random.key(0), 20)
+planned_episodes = jax.jit(planner.walk, static_argnames=("environment", "objective", "num_episodes"))
 
 
 def bound(domain: str, lam: float, objective: str) -> tuple[float, float, str]:
     """The exact planner's return, explicability and route."""
     task = peps_envs.make(domain)
-    episodes = planned_episodes(task.environment, task.params, task.beliefs[task.default_belief], lam, objective)
+    episodes = planned_episodes(task.environment, task.params, task.beliefs[task.default_belief], objective, lam, 20)
     way = route(domain, np.asarray(episodes.perceived[0]), bool(episodes.goal_reached[0]))
     return float(episodes.return_.mean()), float(episodes.explicability.mean()), way
 
@@ -124,6 +111,7 @@ def main() -> None:
     parser.add_argument("--lam-seeds", type=int, default=4, help="trainings per domain and lambda")
     parser.add_argument("--steps", type=int, default=Config().total_steps, help="environment steps of a training")
     arguments = parser.parse_args()
+    use_every_core()
     base = Config(total_steps=arguments.steps)
     seeds = list(range(arguments.seeds))
     lines, record = [], {"seeds": arguments.seeds, "steps": arguments.steps, "domains": {}}

@@ -18,7 +18,7 @@ from jax import Array
 
 from peps_envs.navigation import Navigation, NavigationParams, NavigationState, inside
 from peps_envs.registry import unknown_name
-from peps_jax.evaluate import Policy
+from peps_jax.evaluate import Evaluation, Policy, evaluate_policy
 
 OBJECTIVES = ("return", "human", "peps")
 
@@ -125,3 +125,18 @@ def solve(
         return actions[jnp.argmax(rewards + jnp.sum(weights * values[index], -1))], jnp.zeros(())
 
     return Plan(values=values.reshape(resolution, resolution), residual=residual, policy=policy)
+
+
+def walk(
+    environment: Navigation,
+    params: NavigationParams,
+    belief: NavigationParams,
+    objective: str,
+    lam: float | Array,
+    num_episodes: int,
+    **how: Any,
+) -> Evaluation:
+    """Episodes of the plan for `objective`, in the dynamics that it is made for; `how` as `solve` takes it."""
+    plan = solve(params, belief, objective, lam, **how)
+    acting = belief if objective == "human" else params
+    return evaluate_policy(plan.policy, environment, acting, belief, jax.random.key(0), num_episodes)

@@ -30,7 +30,7 @@ def call(arguments, tiny) -> int:
 def no_training(monkeypatch):
     """Nothing may be compiled or planned."""
 
-    def refuse(*arguments):
+    def refuse(*arguments, **settings):
         raise AssertionError("compiled")
 
     monkeypatch.setattr(batch, "Program", refuse)

@@ -18,7 +18,7 @@ import numpy as np
 import peps_envs
 from peps_jax import batch, planner
 from peps_jax.config import Config
-from peps_jax.evaluate import Evaluation, evaluate, evaluate_policy
+from peps_jax.evaluate import Evaluation, evaluate
 from peps_jax.reproduce.store import ROUTES, Record, Store, episodes, settings_of
 from peps_jax.sweep import train_batches
 from peps_jax.train import Result, check
@@ -181,25 +181,12 @@ def _plan(planned: Planned, num_episodes: int) -> Record:
     start = time.perf_counter()
     task = peps_envs.make(planned.env)
     belief = task.beliefs[task.default_belief]
-    how = tuple(PLANNER[planned.objective].items())
-    numbers = task.params, belief, planned.lam, planned.gamma
-    evaluation = _plan_and_walk(task.environment, planned.objective, how, num_episodes, *numbers)
-    evaluation = jax.device_get(evaluation)
+    asked = task.environment, task.params, belief, planned.objective, planned.lam, num_episodes
+    evaluation = jax.device_get(_plan_and_walk(*asked, gamma=planned.gamma, **PLANNER[planned.objective]))
     routes = evaluation.perceived[:ROUTES]
     return Record(episodes(evaluation), {}, routes, {}, failed=False, seconds=time.perf_counter() - start)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
-def _plan_and_walk(
-    environment: peps_envs.Environment,
-    objective: str,
-    how: tuple[tuple[str, int], ...],
-    num_episodes: int,
-    params: Any,
-    belief: Any,
-    lam: Any,
-    gamma: Any,
-) -> Evaluation:
-    plan = planner.solve(params, belief, objective, lam, gamma=gamma, **dict(how))
-    acting = belief if objective == "human" else params
-    return evaluate_policy(plan.policy, environment, acting, belief, jax.random.key(0), num_episodes)
+_plan_and_walk = jax.jit(
+    planner.walk, static_argnames=("environment", "objective", "num_episodes", "points", "resolution")
+)
