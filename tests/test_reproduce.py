@@ -239,7 +239,7 @@ def test_the_papers_numbers_say_what_the_paper_says():
 def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_training, monkeypatch):
     monkeypatch.setattr(plots, "DOTS", 30)
     fill(tmp_path, tiny, seeds=3)
-    assert call(["--seeds", 3, "--out", tmp_path], tiny) == 0
+    assert call(["all", "--seeds", 3, "--out", tmp_path], tiny) == 0
     written = {path.name for path in tmp_path.iterdir()} - {store.HEAD, store.CELLS}
     pictures = ("figure1", "figure2", "frontier", "queries")
     assert written == {"improvement.csv"} | {
