@@ -355,11 +355,19 @@ def test_a_cell_alone_in_a_split_batch_and_beside_a_failing_one(line, train):
     one_per_device = int((need.working + 2 * need.state + 100) / batch.AVAILABLE_SHARE)
     batches = batch.plan(cells, EPISODES, free=one_per_device)
     assert [one.cells for one in batches] == [(0, 1), (2,)]
-    reported = []
-    finished, times = batch.run(cells, EPISODES, batches, report=lambda done, curves: reported.append(done))
+    reported, finished = [], []
+
+    class Listener(batch.Watch):
+        def advanced(self, batch, rounds, curves, snapshot):
+            reported.append(rounds)
+
+        def finished(self, batch, cells, times):
+            finished.extend(cells)
+            assert times.run > 0
+
+    batch.run(cells, batches, EPISODES, Listener())
     assert [cell.failed for cell in finished] == [False, True, False]
     assert reported == [1, 2, 3, 4] * 2
-    assert times.run > 0
 
     alone = train(cells[2])
     for name, curve in alone.curves.items():
