@@ -84,8 +84,7 @@ def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
         fill(unfinished)
         for inside in (file for file in unfinished.rglob("*") if file.is_file()):
             _sync(inside)
-        if path.exists():
-            remove(path)
+        remove(path)
 
     _put_in_place(path, write)
 
@@ -121,11 +120,15 @@ def make_folder(path: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Removes a folder: at once for a reader, who never sees a part of it."""
-    if path.exists():
-        leaving = path.with_name(f"{TEMPORARY}{path.name}-removed-{os.getpid()}")
+    """Removes a folder, if it is there: at once for a reader, who never sees a part of it."""
+    leaving = path.with_name(f"{TEMPORARY}{path.name}-removed-{os.getpid()}")
+    try:
         os.replace(path, leaving)
-        shutil.rmtree(leaving, ignore_errors=True)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise NotWrittenError(f"{str(path)!r} can't be removed: {error.strerror or error}") from None
+    shutil.rmtree(leaving, ignore_errors=True)
 
 
 def remove_unfinished(folder: Path) -> None:

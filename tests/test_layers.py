@@ -32,7 +32,7 @@ LAYERS = (
     {f"peps_jax.{name}" for name in ("evaluate", "planner", "statistics")},
     {"peps_jax.batch"},
     {"peps_jax.results"},
-    {f"peps_jax.{name}" for name in ("checkpoint", "plots", "progress")},
+    {f"peps_jax.{name}" for name in ("checkpoint", "plots", "progress", "request")},
     {"peps_jax.film", "peps_jax.study"},
     {"peps_jax.ledger"},
     {"peps_jax.processes"},

@@ -210,7 +210,8 @@ def start(environment, *arguments: str) -> subprocess.Popen:
 def test_a_process_that_is_killed_is_continued(compiled, tmp_path):
     flags = ["--env", "nav-d1", "--method", "sac", "--seeds", "2", "--total-steps", "1200", *SIZES]
     process = start(compiled, *flags, "--out", tmp_path / "whole")
-    assert process.wait(600) == 0, process.communicate()
+    _, error = process.communicate(timeout=600)
+    assert process.returncode == 0, error
     chance, folder = random.Random(0), tmp_path / "out"
     for rounds in (3, 17):
         process = start(compiled, "--resume", *flags, "--out", folder)
