@@ -17,7 +17,7 @@ import jax
 from cells import compile_over_devices
 
 from peps_jax import Config, train
-from peps_jax.sweep import use_every_core
+from peps_jax.command_line import use_every_core
 
 FOLDER = pathlib.Path(__file__).parent / "results"
 

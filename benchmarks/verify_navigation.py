@@ -24,9 +24,9 @@ from scipy import stats
 import peps_envs
 from peps_envs.navigation import NavigationState
 from peps_jax import Config, evaluate, planner
+from peps_jax.command_line import use_every_core
 from peps_jax.parts import human, surrogate
 from peps_jax.statistics import estimate, mean
-from peps_jax.sweep import use_every_core
 from peps_jax.train import finish, init, run_rounds
 
 DOMAINS = ("nav-d1", "nav-d2", "nav-d3", "nav-d4")

@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from peps_envs.registry import unknown_name
+from peps_jax.command_line import Parser, options, refuse, use_every_core
 from peps_jax.config import Config
+from peps_jax.files import NotWrittenError
 from peps_jax.reproduce import figures, tables
 from peps_jax.reproduce.store import Store
 from peps_jax.reproduce.study import DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
-from peps_jax.sweep import Parser, options, use_every_core
 
 PROG = "python -m peps_jax.reproduce"
 MOST = 1000  # seeds
@@ -126,9 +127,8 @@ def main(arguments: Sequence[str] | None = None, base: Config | None = None, num
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         wanted = request(arguments, Config() if base is None else base, num_episodes)
-    except ValueError as error:
-        print(f"{PROG}: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+    except (ValueError, NotWrittenError) as error:
+        return refuse(PROG, error)
     try:
         written = run(wanted)
     except KeyboardInterrupt:
@@ -136,6 +136,8 @@ def main(arguments: Sequence[str] | None = None, base: Config | None = None, num
             f"\nstopped: what is finished is kept in {wanted.store.folder}; the same command continues", file=sys.stderr
         )
         return 130
+    except NotWrittenError as error:
+        return refuse(PROG, f"{error}; what is finished is kept, and the same command continues")
     for path in written:
         if path.suffix == ".md":
             print(path.read_text())
