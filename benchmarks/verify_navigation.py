@@ -16,12 +16,12 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-from cells import compile_over_devices
 from scipy import stats
 
 import peps_envs
 from peps_envs.navigation import NavigationState
 from peps_jax import Config, evaluate, planner
+from peps_jax.batch import compile_over_devices
 from peps_jax.parts import human, surrogate
 from peps_jax.sweep import use_every_core
 from peps_jax.train import finish, init, run_rounds
