@@ -199,12 +199,14 @@ def test_conduct_counts_seeds_and_leaves_out_who_failed():
     assert found.return_ == [6, 7]
 
 
-def test_the_studys_lambda_comes_first_and_once():
-    own = experiment.SETTINGS["lam"]
-    peps, sac = experiment.parts([3, 4], 80, lams=(0.0, own, 8.0), names=("peps", "sac"))
-    assert peps.lams == (own, 0.0, 8.0)
-    assert sac.lams == (own,)
-    assert [(float(config.lam), config.seed) for config in peps.configs[:3]] == [(own, 3), (own, 4), (0.0, 3)]
+def test_the_studys_lambda_has_all_seeds_and_others_few():
+    own, seeds = experiment.SETTINGS["lam"], range(3, 13)
+    peps, sac, sweep = experiment.parts(seeds, 80, lams=(0.0, own, 8.0), names=("peps", "sac"))
+    assert (peps.lams, sac.lams, sweep.lams) == ((own,), (own,), (0.0, 8.0))
+    assert (peps.seeds, sweep.seeds) == (tuple(seeds), tuple(seeds[: experiment.FEW_SEEDS]))
+    asked = [(float(config.lam), config.seed) for config in sweep.configs]
+    assert asked == [(lam, seed) for lam in (0.0, 8.0) for seed in sweep.seeds]
+    assert len(experiment.parts(seeds, 80, lams=())) == len(experiment.METHODS)
 
 
 @pytest.mark.parametrize(
@@ -255,7 +257,7 @@ def test_a_small_study_from_end_to_end(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_each_answer_is_given_once(given):
+def test_an_agent_is_taught_all_answers(given):
     answers = jax.tree.map(lambda rows: rows[:21], given)
     small = dict(num_envs=4, rollout_length=10, warmup_steps=40, batch_size=16, hidden_sizes=(8,), num_queries=21)
     config = experiment.settings("drlhp", 0, 80, **small)

@@ -45,7 +45,7 @@ def _parts(made: Study) -> list[Part]:
 
 
 def _path(part: Part, folder: Path) -> Path:
-    return folder / CELLS / f"driving-{part.method}-{len(part.seeds)}-seeds.npz"
+    return folder / CELLS / f"driving-{part.name.replace(' ', '-')}-{len(part.seeds)}-seeds.npz"
 
 
 def _digest(part: Part) -> str:

@@ -70,7 +70,7 @@ def text(findings: Findings) -> str:
         f"p = {rated.p:.2g}, η² = {rated.eta_squared:.2f} (paper: p = 0.037). Of {len(findings.groups)} groups of raters "
         f"{told['highest']:.0%} rate PEPS highest, {told['significant']:.0%} differ with p < 0.05, both in {told['both']:.0%}.",
     ]
-    if findings.over_lam:
+    if len(findings.over_lam) > 1:
         rows = [[f"{lam:g}", *_behaves(found)] for lam, found in findings.over_lam.items()]
         parts += [f"PEPS over λ, of which the study's is {SETTINGS['lam']:g}:", _table(["λ", *heads], rows)]
     return "\n\n".join(parts) + "\n"
