@@ -91,11 +91,14 @@ def test_both_pieces_of_a_pair_begin_alike(given):
     assert 0.3 < np.mean(lengths[:, 0] == lengths[:, 1]) < 0.8, "both kinds of pairs"
 
 
-def test_drivers_who_act_on_purpose_brake_and_then_change_lane():
+def test_drivers_who_act_on_purpose_wait_and_then_change_lane():
     planned = np.asarray(comparisons.plans(jax.random.key(0), 2_000))
-    ways = {(SLOWER,) * brakes + (LANE_LEFT,) * (brakes < 8) for brakes in range(9)}
-    purposeful = [any(tuple(plan[: len(way)]) == way for way in ways) for plan in planned]
-    assert comparisons.PURPOSEFUL <= np.mean(purposeful) < 1
+    ways = {(action,) * wait + (LANE_LEFT,) * (wait < 8) for wait in range(9) for action in range(5)}
+    purposeful = np.array([any(tuple(plan[: len(way)]) == way for way in ways) for plan in planned])
+    assert comparisons.PURPOSEFUL <= purposeful.mean() < 1
+    late = purposeful & (planned[:, 0] != LANE_LEFT)
+    assert np.mean(planned[late, 0] == SLOWER) > comparisons.BRAKING
+    assert np.mean(planned[late, 0] == IDLE) > 0.05
     assert set(np.unique(planned)) == set(range(5))
 
 

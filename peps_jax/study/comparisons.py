@@ -2,8 +2,9 @@
 
 The paper's authors chose the pairs by hand. Here both pieces of a pair begin at the same moment of scenes that start alike, and
 most drivers handle the scene on purpose: they brake for a while, from not at all to the very end, and then change lane. Where
-all drivers acted at random and pieces were cut anywhere, hardly a pair told braking first from steering at once, and r-hat
-differed between the two by as much as between two groups of participants.
+all drivers acted at random and pieces were cut anywhere, hardly a pair told braking first from steering at once, and r-hat's
+difference between the two was no larger than its error. Some wait without braking: where late lane changes were all slow ones,
+r-hat liked them for being late, and agents waited a second and then steered at full speed.
 """
 
 from __future__ import annotations
@@ -12,14 +13,17 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+import peps_envs
 from peps_envs.highway.vehicle import LANE_LEFT, SLOWER
 from peps_jax import rollout
 from peps_jax.parts.trajectory import Preferences, Segments
 from peps_jax.study.participants import answers, attentive, recruit
 from peps_jax.study.scenes import DRY, HORIZON, crashed, road, whole
 
+NUM_ACTIONS = peps_envs.make(DRY).environment.action_space.size
 TRAINERS, ANSWERS = 15, 200  # participants who compare, and how many pairs each of them
-PURPOSEFUL = 0.8  # share of drivers who brake and then change lane; the others act at random
+PURPOSEFUL = 0.8  # share of drivers who wait, most of them braking, and then change lane; the others act at random
+BRAKING = 0.5  # share of those who brake meanwhile; the others hold any action, which tells late from slow lane changes
 FROM_START = 0.8  # share of pairs that begin with the scene; the others begin anywhere
 SAME_LENGTH = 0.5  # share of pairs whose pieces are equally long; the others' unequal lengths tell r-hat's level
 SHORTEST = 2  # steps of a piece
@@ -27,15 +31,21 @@ SPARE = 2  # pairs that are made for each that is shown, because in some of them
 
 
 def plans(key: Array, number: int) -> Array:
-    """What `number` drivers do, (number, HORIZON): at random, each action held for one to four steps, or on purpose at first."""
-    key_hold, key_action, key_brake, key_purpose = jax.random.split(key, 4)
-    time = jnp.arange(HORIZON)[None]
-    hold = jax.random.randint(key_hold, (number, 1), 1, 5)
-    drawn = jax.random.randint(key_action, (number, HORIZON), 0, 5)
+    """What `number` drivers do, (number, HORIZON).
+
+    At random, each action held for one to four steps; or on purpose: one action, mostly braking, is held for a while, from not at
+    all to the very end, then the lane is changed, and what follows is random again.
+    """
+    key_hold, key_action, key_until, key_first, key_brake, key_purpose = jax.random.split(key, 6)
+    time, column = jnp.arange(HORIZON)[None], (number, 1)
+    hold = jax.random.randint(key_hold, column, 1, 5)
+    drawn = jax.random.randint(key_action, (number, HORIZON), 0, NUM_ACTIONS)
     random = jnp.take_along_axis(drawn, time // hold, 1)
-    until = jax.random.randint(key_brake, (number, 1), 0, HORIZON + 1)
-    purposeful = jnp.where(time < until, SLOWER, jnp.where(time == until, LANE_LEFT, random))
-    return jnp.where(jax.random.bernoulli(key_purpose, PURPOSEFUL, (number, 1)), purposeful, random)
+    until = jax.random.randint(key_until, column, 0, HORIZON + 1)
+    other = jax.random.randint(key_first, column, 0, NUM_ACTIONS)
+    first = jnp.where(jax.random.bernoulli(key_brake, BRAKING, column), SLOWER, other)
+    purposeful = jnp.where(time < until, first, jnp.where(time == until, LANE_LEFT, random))
+    return jnp.where(jax.random.bernoulli(key_purpose, PURPOSEFUL, column), purposeful, random)
 
 
 def drive(key: Array, number: int) -> Segments:
