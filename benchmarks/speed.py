@@ -14,9 +14,9 @@ import time
 from typing import NamedTuple
 
 import jax
-from cells import compile_over_devices
 
 from peps_jax import Config, train
+from peps_jax.batch import compile_over_devices
 from peps_jax.command_line import use_every_core
 
 FOLDER = pathlib.Path(__file__).parent / "results"

@@ -18,12 +18,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from cells import compile_over_devices
 from scipy import stats
 
 import peps_envs
 from peps_envs.navigation import NavigationState
 from peps_jax import Config, evaluate, planner
+from peps_jax.batch import compile_over_devices
 from peps_jax.command_line import use_every_core
 from peps_jax.parts import human, surrogate
 from peps_jax.statistics import estimate, mean

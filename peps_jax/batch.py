@@ -486,3 +486,16 @@ def run(cells: Sequence[Config], batches: Sequence[Batch], num_episodes: int, wa
         report = functools.partial(watch.advanced, batch)
         finished, running = compiled.run([cells[place] for place in batch.cells], report, start)
         watch.finished(batch, finished, compiling + running)
+
+
+def compile_over_devices(function: Callable[[Config], Any], configs: Sequence[Config]) -> tuple[Any, Config]:
+    """The compiled program of any `function` for all `configs`, one at a time on each device, and what to call it with.
+
+    Results have a leading axis of cells: the given ones, and then copies of the last that fill up the devices.
+    """
+    mesh, spec = jax.make_mesh((jax.device_count(),), ("cells",)), P("cells")
+    padded = [*configs, *[configs[-1]] * (-len(configs) % jax.device_count())]
+    cells = jax.device_put(stack(padded), NamedSharding(mesh, spec))
+    on_device = lambda cells: jax.lax.map(function, cells)
+    mapped = jax.shard_map(on_device, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+    return jax.jit(mapped).lower(cells).compile(), cells

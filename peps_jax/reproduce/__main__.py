@@ -19,16 +19,17 @@ from peps_envs.registry import unknown_name
 from peps_jax.command_line import Parser, options, refuse, use_every_core
 from peps_jax.config import Config
 from peps_jax.files import NotWrittenError
-from peps_jax.reproduce import figures, tables
+from peps_jax.reproduce import driving, figures, tables
 from peps_jax.reproduce.store import Store
 from peps_jax.reproduce.study import DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
+from peps_jax.study.experiment import STEPS
 
 PROG = "python -m peps_jax.reproduce"
 MOST = 1000  # seeds
 DESCRIPTION = f"""\
 The paper's evaluation: {", ".join(METHODS)} on {", ".join(DOMAINS)},
-each with every seed, and the known-model planner beside them. Trainings are kept in
-the folder: a stopped command continues where it was, and results share them."""
+each with every seed, and the known-model planner beside them; and the driving study
+(figure3). Trainings are kept in the folder: a stopped command continues where it was, and results share them."""
 
 
 class Result(NamedTuple):
@@ -43,6 +44,7 @@ RESULTS = {
     "table1": Result("return and explicability of every method", tables.table1_needs, tables.table1),
     "figure1": Result("the learned surrogate reward beside the true one", figures.figure1_needs, figures.figure1),
     "figure2": Result("rollouts of every method", figures.figure2_needs, figures.figure2),
+    "figure3": Result("behaviours and ratings in the driving study", driving.figure3_needs, driving.figure3),
     "frontier": Result("return and explicability over lambda", figures.frontier_needs, figures.frontier),
     "queries": Result("explicability over the number of queries", figures.queries_needs, figures.queries),
     "ablations": Result("PEPS and DRLHP without parts of them", tables.ablations_needs, tables.ablations),
@@ -72,7 +74,8 @@ def parser() -> Parser:
     made.add_argument("--out", default="results/reproduce", metavar="DIR", help="folder [results/reproduce]")
     made.add_argument("--seeds", default=10, help="trainings of each method in each domain [10]", **options(10))
     steps = Config().total_steps
-    made.add_argument("--steps", default=None, help=f"environment steps of a training [{steps}]", **options(steps))
+    text = f"environment steps of a training [{steps}, and {STEPS} of the driving study's]"
+    made.add_argument("--steps", default=None, help=text, **options(steps))
     return made
 
 
@@ -98,6 +101,8 @@ def request(arguments: Sequence[str], base: Config, num_episodes: int) -> Reques
     wanted = [what for name in names for what in RESULTS[name].needs(made.study)]
     missing = made.study.missing(wanted, made.store)
     made.study.batches([what for what in missing if isinstance(what, Training)][:1])  # to see, early, that one fits
+    if "figure3" in names:
+        driving.check(made.study, made.store.folder)
     made.store.open()
     return made
 
@@ -109,7 +114,8 @@ def run(wanted: Request) -> list[Path]:
         needs = RESULTS[name].needs(wanted.study)
         missing = wanted.study.missing(needs, wanted.store)
         number = len({what.name for what in needs})
-        print(f"{name}: {number - len(missing)} of {number} trainings and plans are there", file=sys.stderr, flush=True)
+        there = f"{number - len(missing)} of {number} trainings and plans are there" if number else "the driving study"
+        print(f"{name}: {there}", file=sys.stderr, flush=True)
         wanted.study.make(missing, wanted.store)
         written += RESULTS[name].write(wanted.study, wanted.store.folder)
     return written
