@@ -10,8 +10,9 @@ import os
 import pathlib
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 FOLDER = pathlib.Path(__file__).parent
 SCRIPTS, HOMES = FOLDER / "peers", FOLDER / ".peers"
@@ -21,6 +22,13 @@ PATIENCE = 1_800.0  # s that a script may take
 
 class Missing(Exception):
     """A peer can't be installed or run; one line says why."""
+
+
+class Running(NamedTuple):
+    """A script that was started."""
+
+    process: subprocess.Popen
+    errors: IO[str]  # what it complains of: in a file, which doesn't fill up as a pipe does
 
 
 class Answer(NamedTuple):
@@ -72,16 +80,17 @@ def measure(name: str, script: str, arguments: Sequence[object], processes: int)
         for process in range(processes):
             command = [python, "-W", "ignore", SCRIPTS / script, *arguments, "--wait"]
             running.append(_start(command, _surroundings(name), CORES if processes == 1 else [CORES[process]]))
-        for process in running:
-            _next_line(process, "ready")
-        for process in running:
-            process.stdin.write("go\n")
-            process.stdin.flush()
-        answers = [json.loads(_next_line(process, "{")) for process in running]
+        for started in running:
+            _next_line(started, "ready")
+        for started in running:
+            started.process.stdin.write("go\n")
+            started.process.stdin.flush()
+        answers = [json.loads(_next_line(started, "{")) for started in running]
     finally:
-        for process in running:
-            process.kill()
-            process.communicate()
+        for started in running:
+            started.process.kill()
+            started.process.communicate()
+            started.errors.close()
     rate = sum(answer["steps"] / answer["seconds"] for answer in answers)
     return Answer(rate, max(answer["preparation"] for answer in answers))
 
@@ -110,23 +119,26 @@ def _surroundings(name: str) -> dict[str, str]:
     return kept | ours
 
 
-def _start(command: Sequence[object], surroundings: dict[str, str], cores: Sequence[int]) -> subprocess.Popen:
-    pipe, words = subprocess.PIPE, list(map(str, command))
-    if not hasattr(os, "sched_setaffinity"):
-        return subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=surroundings)
-    os.sched_setaffinity(0, cores)  # this thread's, which the process inherits
+def _start(command: Sequence[object], surroundings: dict[str, str], cores: Sequence[int]) -> Running:
+    pipe, errors = subprocess.PIPE, tempfile.TemporaryFile("w+")  # noqa: SIM115, it outlives this function
+    pin = getattr(os, "sched_setaffinity", lambda process, cores: None)
+    pin(0, cores)  # this thread's, which the process inherits
     try:
-        return subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=surroundings)
+        process = subprocess.Popen(
+            list(map(str, command)), stdin=pipe, stdout=pipe, stderr=errors, text=True, env=surroundings
+        )
     finally:
-        os.sched_setaffinity(0, CORES)
+        pin(0, CORES)
+    return Running(process, errors)
 
 
-def _next_line(process: subprocess.Popen, start: str) -> str:
+def _next_line(started: Running, start: str) -> str:
     """The next line of output that begins with `start`; libraries print lines of their own."""
-    for line in process.stdout:
+    for line in started.process.stdout:
         if line.startswith(start):
             return line
-    raise Missing(_last_line(process.communicate()[1]))
+    started.errors.seek(0)
+    raise Missing(_last_line(started.errors.read()))
 
 
 def _call(command: Sequence[object], surroundings: dict[str, str] | None = None) -> str:

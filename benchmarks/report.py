@@ -207,20 +207,21 @@ def draw(record: Record, path: pathlib.Path) -> None:
 
 def _bars(panel: Any, names: list[str], rates: list[float | None], colours: list[str]) -> None:
     places = range(len(names))[::-1]
-    panel.barh(places, [rate or 1.0 for rate in rates], color=colours)
+    least = min(filter(None, rates)) / 4
+    panel.barh(places, [rate or least for rate in rates], color=colours)
     panel.set_yticks(places, names)
     panel.set_xscale("log")
     for place, rate in zip(places, rates, strict=True):
         label = "not measured" if rate is None else f"{rate:,.0f}"
-        panel.annotate(label, (rate or 1.0, place), (4, 0), textcoords="offset points", va="center", fontsize=8)
-    panel.margins(x=0.2)
+        panel.annotate(label, (rate or least, place), (4, 0), textcoords="offset points", va="center", fontsize=8)
+    panel.set_xlim(least, max(filter(None, rates)) * 6)
 
 
 def _draw_worlds(panel: Any, worlds: Record) -> None:
     rows = [(f"{name}, peps_jax", row.get("rate"), COLOURS[0]) for name, row in worlds["rates"].items()]
     rows += [(f"{row['world']}, {name}", row.get("rate"), QUIET) for name, row in worlds["others"].items()]
     _bars(panel, *map(list, zip(*rows, strict=True)))
-    panel.set_title("Worlds alone: environment steps a second")
+    panel.set_title("Worlds alone: steps a second on all cores")
 
 
 def _draw_sac(panel: Any, record: Record) -> None:
@@ -231,7 +232,7 @@ def _draw_sac(panel: Any, record: Record) -> None:
         rows.append((f"SAC {width}, products alone", record["roof"][width]["rate"], COLOURS[1]))
     rows += [(f"PEPS {width}, peps_jax", row["rate"], COLOURS[4]) for width, row in training["peps"].items()]
     _bars(panel, *map(list, zip(*rows, strict=True)))
-    panel.set_title("Training: environment steps a second on all cores")
+    panel.set_title("Training: steps a second on all cores")
 
 
 def _draw_rounds(panel: Any, rounds: Record) -> None:
@@ -246,7 +247,7 @@ def _draw_rounds(panel: Any, rounds: Record) -> None:
     panel.set_yticks(range(len(rounds)), [f"{name.upper()}" for name in reversed(rounds)])
     panel.set_xlabel("share of the whole round's time")
     panel.set_title("Where a round's time goes, each part on its own")
-    panel.legend(fontsize=8, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.18), frameon=False)
+    panel.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.35, -0.16), frameon=False)
 
 
 def _draw_growth(panel: Any, growth: Record) -> None:
