@@ -5,7 +5,7 @@ BIN := .venv/bin
 READY := .venv/ready
 ARGS ?=
 
-.PHONY: sweep reproduce test verify-navigation benchmark benchmark-highway readme lint lock setup
+.PHONY: sweep reproduce test verify-navigation benchmark readme lint lock setup
 .DEFAULT_GOAL := sweep
 
 sweep: $(READY)
@@ -21,11 +21,9 @@ test: $(READY)
 verify-navigation: $(READY)
 	$(BIN)/python benchmarks/verify_navigation.py $(ARGS)
 
+# beside other libraries, which it installs under benchmarks/.peers; ARGS="--quick" for a little of everything
 benchmark: $(READY)
 	$(BIN)/python benchmarks/speed.py $(ARGS)
-
-benchmark-highway: $(READY)
-	$(BIN)/python benchmarks/highway.py $(ARGS)
 
 readme: $(READY)
 	$(BIN)/python benchmarks/readme.py

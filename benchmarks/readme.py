@@ -2,7 +2,8 @@
 
     make readme
 
-A table stands between `<!-- begin FILE -->` and `<!-- end -->`; FILE is what a measuring command wrote.
+A table stands between `<!-- begin FILE -->` and `<!-- end -->`; FILE is what a measuring command wrote. Pictures that it shows
+lie beside it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ def embedded(text: str) -> str:
     """`text` with every marked place holding its file's content."""
 
     def replace(match: re.Match) -> str:
-        content = (ROOT / match[1]).read_text().strip()
+        folder = match[1].rpartition("/")[0]
+        content = re.sub(r"\]\((?=[^)/]+\.png\))", f"]({folder}/", (ROOT / match[1]).read_text().strip())
         return f"<!-- begin {match[1]} -->\n{content}\n<!-- end -->"
 
     return re.sub(r"<!-- begin (\S+) -->\n.*?<!-- end -->", replace, text, flags=re.DOTALL)
