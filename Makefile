@@ -4,8 +4,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 ARGS ?=
+REPRODUCED ?= results/reproduce
 
-.PHONY: sweep reproduce test verify-navigation benchmark readme lint lock setup
+.PHONY: sweep reproduce test verify-navigation benchmark readme publish lint lock setup
 .DEFAULT_GOAL := sweep
 
 sweep: $(READY)
@@ -26,6 +27,12 @@ benchmark: $(READY)
 	$(BIN)/python benchmarks/speed.py $(ARGS)
 
 readme: $(READY)
+	$(BIN)/python benchmarks/readme.py
+
+# what README shows of `make reproduce`, from its folder
+publish: $(READY)
+	cp $(filter-out %/figure1.csv %/figure2.csv,$(wildcard $(addprefix $(REPRODUCED)/,*.md *.csv figure3.json *.png *.gif))) \
+		benchmarks/results/
 	$(BIN)/python benchmarks/readme.py
 
 lint: $(READY)
