@@ -127,26 +127,22 @@ def free_port() -> int:
 
 @pytest.mark.slow
 def test_two_processes_have_the_numbers_of_one(tmp_path):
-    devices = lambda number: {"XLA_FLAGS": os.environ["XLA_FLAGS"].replace("device_count=2", f"device_count={number}")}
+    one_device = {"XLA_FLAGS": os.environ["XLA_FLAGS"].replace("device_count=2", "device_count=1")}  # the same program
     cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "compiled"), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     flags = ["--env", "nav-d1", "--method", "sac", "--seeds", "8", *SIZES]
 
-    def start(number: int, *more: str) -> subprocess.Popen:
+    def start(*more: str) -> subprocess.Popen:
         command = [sys.executable, "-m", "peps_jax.sweep", *flags, *more]
-        environment = os.environ | cache | devices(number)
+        environment = os.environ | cache | one_device
         return subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
     coordinator = f"localhost:{free_port()}"
-    pair = [
-        start(
-            1, "--out", str(tmp_path / "two"), "--coordinator", coordinator, "--processes", "2", "--process", str(index)
-        )
-        for index in (0, 1)
-    ]
+    together = ("--out", str(tmp_path / "two"), "--coordinator", coordinator, "--processes", "2")
+    pair = [start(*together, "--process", str(index)) for index in (0, 1)]
     told = [process.communicate(timeout=600) for process in pair]
     assert [process.returncode for process in pair] == [0, 0], told
     assert "process 1: its share is done" in told[1][1]
-    one = start(2, "--out", str(tmp_path / "one"))
+    one = start("--out", str(tmp_path / "one"))
     _, error = one.communicate(timeout=600)
     assert one.returncode == 0, error
     assert contents(tmp_path / "two") == contents(tmp_path / "one")
