@@ -1,4 +1,4 @@
-"""Copies measured tables into the README, so that no figure there is typed by hand.
+"""Copies measured tables into the README and the pages beside it, so that no figure there is typed by hand.
 
     make readme
 
@@ -12,7 +12,7 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-README = ROOT / "README.md"
+PAGES = (ROOT / "README.md", ROOT / "docs" / "cluster.md")
 
 
 def embedded(text: str) -> str:
@@ -27,4 +27,5 @@ def embedded(text: str) -> str:
 
 
 if __name__ == "__main__":
-    README.write_text(embedded(README.read_text()))
+    for page in PAGES:
+        page.write_text(embedded(page.read_text()))

@@ -19,7 +19,7 @@ from typing import Any
 
 import jax
 
-from peps_jax.sweep import use_every_core
+from peps_jax.command_line import use_every_core
 
 FOLDER = pathlib.Path(__file__).parent
 SECTIONS = ("worlds", "training", "roof", "rounds", "growth")

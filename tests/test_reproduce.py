@@ -4,15 +4,17 @@ import csv
 import json
 import math
 
+import jax
 import numpy as np
 import pytest
 
-from peps_jax import batch, plots
+from peps_jax import Config, batch, plots
 from peps_jax.reproduce import __main__ as command
-from peps_jax.reproduce import figures, store, study, tables
+from peps_jax.reproduce import driving, figures, store, study, tables
 from peps_jax.reproduce.store import Record, Store
 from peps_jax.reproduce.study import DOMAINS, METHODS, Study
 from peps_jax.statistics import Estimate
+from peps_jax.study import experiment
 
 PREFIX = "python -m peps_jax.reproduce: error: "
 EPISODES = 4
@@ -184,6 +186,37 @@ def test_the_typical_training_is_the_median_one(tiny, monkeypatch):
     assert made.typical(trainings[3:], lambda record: record.mean("return")) is None
 
 
+# --- driving --------------------------------------------------------------------------------------------------------------
+
+
+def test_what_the_driving_study_trained_is_kept(tmp_path, tiny, capsys, monkeypatch):
+    monkeypatch.setattr(experiment, "METHODS", ("sac",))
+    made, asked = Study(tiny, 2, EPISODES), []
+    part, over_lam = driving._parts(made)
+    assert driving._path(part, tmp_path) != driving._path(over_lam, tmp_path)
+    assert part.steps == tiny.total_steps, "the length that was asked for"
+    assert driving._parts(Study(Config(), 2, EPISODES))[0].steps == experiment.STEPS
+
+    def pretend(part):
+        asked.append(part)
+        like = jax.eval_shape(lambda config: experiment.learn(config, part.episodes), part.configs[0])
+        return jax.tree.map(lambda leaf: np.full((1, 2, *leaf.shape), 3, leaf.dtype), like)
+
+    monkeypatch.setattr(experiment, "run_part", pretend)
+    first, again = driving._make(part, tmp_path), driving._make(part, tmp_path)
+    assert asked == [part], "the second time from the file"
+    jax.tree.map(np.testing.assert_array_equal, first, again)
+    driving.check(made, tmp_path)
+    with pytest.raises(ValueError, match="made with other settings or code"):
+        driving.check(Study(tiny.replace(total_steps=320), 2, EPISODES), tmp_path)
+    Store(tmp_path / "other", tiny, EPISODES, seeds=2).open()
+    driving._path(part, tmp_path / "other").write_bytes(b"PK half a file")
+    assert call(["figure3", "--seeds", 2, "--out", tmp_path / "other"], tiny) == 2
+    error = capsys.readouterr().err
+    assert "can't be read: remove it" in error
+    assert error.count("\n") == 1
+
+
 # --- tables ---------------------------------------------------------------------------------------------------------------
 
 
@@ -238,8 +271,10 @@ def test_the_papers_numbers_say_what_the_paper_says():
 
 def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_training, monkeypatch):
     monkeypatch.setattr(plots, "DOTS", 30)
+    monkeypatch.setattr(driving.experiment, "run", lambda parts, make: {part.method for part in parts})
+    monkeypatch.setattr(driving.report, "write", lambda found, folder: [folder / f"figure3 of {len(found)} methods"])
     fill(tmp_path, tiny, seeds=3)
-    assert call(["--seeds", 3, "--out", tmp_path], tiny) == 0
+    assert call(["all", "--seeds", 3, "--out", tmp_path], tiny) == 0
     written = {path.name for path in tmp_path.iterdir()} - {store.HEAD, store.CELLS}
     pictures = ("figure1", "figure2", "frontier", "queries")
     assert written == {"improvement.csv"} | {
@@ -250,7 +285,9 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
     failing = next(line for line in lines if (line["domain"], line["method"]) == ("nav-d1", "drlhp"))
     assert (failing["seeds"], failing["failed"], failing["return_paper"]) == ("2", "1", "74.51")
     assert "2 (1 failed)" in (tmp_path / "table1.md").read_text()
-    assert "table1.tex" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "table1.tex" in printed
+    assert "figure3 of 4 methods" in printed
     assert {line["strategy"] for line in lines_of(tmp_path / "queries.csv")} > {"information_gain", "random"}
     assert {line["method"] for line in lines_of(tmp_path / "frontier.csv")} > {"planner", "peps", "sac"}
     before = {path: path.read_bytes() for path in tmp_path.glob("*.p*")}

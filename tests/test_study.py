@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from peps_envs.highway.vehicle import FASTER, IDLE, LANE_LEFT, SLOWER
-from peps_jax import film, study
+from peps_jax import film
+from peps_jax.study import __main__ as command
+from peps_jax.study import comparisons, experiment, participants, ratings, report
+from peps_jax.study import scenes as road_scenes
 
 PLANS = {
     "steer": [LANE_LEFT, FASTER, *[IDLE] * 6],
@@ -21,7 +24,9 @@ PLANS = {
 @jax.jit
 def follow(plan, key):
     """Four scenes in the rain that follow `plan` (8,)."""
-    return study.watch(lambda observation, key, time: jnp.repeat(plan[time], 4), study.road("highway-rain"), key, 4)
+    return road_scenes.watch(
+        lambda observation, key, time: jnp.repeat(plan[time], 4), road_scenes.road("highway-rain"), key, 4
+    )
 
 
 @pytest.fixture(scope="module")
@@ -31,77 +36,91 @@ def scenes():
 
 @pytest.fixture(scope="module")
 def given():
-    return jax.jit(study.compare)(jax.random.key(3))
+    return jax.jit(comparisons.compare)(jax.random.key(3))
 
 
 def test_participants_scatter_around_the_papers_means():
-    people = study.recruit(jax.random.key(0), 4_000)
+    people = participants.recruit(jax.random.key(0), 4_000)
     ratings = np.stack(jax.tree.leaves(people.ratings))
     np.testing.assert_allclose(ratings.mean(1), [3.42, 4.57, 3.28, 3.78], atol=0.25)  # clipping at 5 takes a little
     assert ratings.min() >= 1
     assert ratings.max() <= 5
-    assert np.mean(people.rationality == 0) == pytest.approx(study.CARELESS, abs=0.02)
+    assert np.mean(people.rationality == 0) == pytest.approx(participants.CARELESS, abs=0.02)
     assert float(people.dry_share.min()) >= 0
     assert np.mean(people.dry_share) == pytest.approx(2 / 3, abs=0.02)
-    again = study.recruit(jax.random.key(0), 4_000)
+    again = participants.recruit(jax.random.key(0), 4_000)
     np.testing.assert_array_equal(again.rationality, people.rationality)
 
 
 def test_a_mind_lies_between_the_true_road_and_a_dry_one():
-    _, rain, _ = study.road("highway-rain").task()
-    _, dry, _ = study.road("highway-dry").task()
-    person = jax.tree.map(lambda leaf: leaf[0], study.recruit(jax.random.key(0), 1))
+    _, rain, _ = road_scenes.road("highway-rain").task()
+    _, dry, _ = road_scenes.road("highway-dry").task()
+    person = jax.tree.map(lambda leaf: leaf[0], participants.recruit(jax.random.key(0), 1))
     for share, expected in ((0.0, rain), (1.0, dry)):
-        believed = study.mind(person.replace(dry_share=jnp.asarray(share)), rain).physics.friction
+        believed = participants.mind(person.replace(dry_share=jnp.asarray(share)), rain).physics.friction
         np.testing.assert_allclose(believed.mean, expected.physics.friction.mean, rtol=1e-6)
         np.testing.assert_allclose(believed.sd, expected.physics.friction.sd, rtol=1e-6)
 
 
 def test_the_sanity_check_removes_who_answers_at_random():
-    people = study.recruit(jax.random.key(1), 200)
-    passed = np.asarray(jax.jit(study.attentive)(jax.random.key(2), people))
+    people = participants.recruit(jax.random.key(1), 200)
+    passed = np.asarray(jax.jit(participants.attentive)(jax.random.key(2), people))
     careless = np.asarray(people.rationality) == 0
     assert passed[~careless].all()
     assert 0.2 < passed[careless].mean() < 0.8, "a coin"
 
 
 def test_nobody_is_shown_a_collision_but_in_the_sanity_check(given):
-    assert given.answers.shape == (study.TRAINERS * study.ANSWERS,)
-    assert not np.any(study.crashed(given.segments))
+    assert given.answers.shape == (comparisons.TRAINERS * comparisons.ANSWERS,)
+    assert not np.any(road_scenes.crashed(given.segments))
     assert set(np.unique(given.answers)) <= {0.0, 1.0}
-    answered = np.asarray(given.answered).reshape(study.TRAINERS, -1)
+    answered = np.asarray(given.answered).reshape(comparisons.TRAINERS, -1)
     assert np.all(answered == answered[:, :1]), "all of a participant's answers count, or none"
 
 
-def test_the_teacher_says_what_the_group_has_said(given):
-    queries = jax.tree.map(lambda rows: rows[:7], given.segments)
-    told = study.teacher(given).answer(jax.random.key(0), queries, study.road("highway-rain"))
-    assert told.answers.shape == (7,)
-    rows = np.asarray(given.segments.observation).reshape(len(given.answers), -1)
-    for observation, answer in zip(np.asarray(told.segments.observation), told.answers, strict=True):
-        (place,) = np.flatnonzero((rows == observation.reshape(1, -1)).all(1))[:1]
-        assert given.answers[place] == answer
+def test_both_pieces_of_a_pair_begin_alike(given):
+    begun = jax.tree.map(lambda rows: np.asarray(rows[:, :, 0]), given.segments.state)
+    first, second = jax.tree.map(lambda rows: rows[:, 0], begun), jax.tree.map(lambda rows: rows[:, 1], begun)
+    np.testing.assert_array_equal(first.time, second.time)
+    fresh = first.time == 0
+    assert fresh.mean() > comparisons.FROM_START
+    for one, other in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_array_equal(one[fresh], other[fresh])
+    lengths = np.asarray(given.segments.mask).sum(-1)
+    assert lengths.min() >= 1
+    assert 0.3 < np.mean(lengths[:, 0] == lengths[:, 1]) < 0.8, "both kinds of pairs"
+
+
+def test_drivers_who_act_on_purpose_wait_and_then_change_lane():
+    planned = np.asarray(comparisons.plans(jax.random.key(0), 2_000))
+    ways = {(action,) * wait + (LANE_LEFT,) * (wait < 8) for wait in range(9) for action in range(5)}
+    purposeful = np.array([any(tuple(plan[: len(way)]) == way for way in ways) for plan in planned])
+    assert comparisons.PURPOSEFUL <= purposeful.mean() < 1
+    late = purposeful & (planned[:, 0] != LANE_LEFT)
+    assert np.mean(planned[late, 0] == SLOWER) > comparisons.BRAKING
+    assert np.mean(planned[late, 0] == IDLE) > 0.05
+    assert set(np.unique(planned)) == set(range(5))
 
 
 def test_behaviours_are_told_apart_by_what_is_seen(scenes):
-    kinds = {name: np.asarray(study.behaviour(seen)).tolist() for name, seen in scenes.items()}
-    assert kinds == {"steer": [0] * 4, "brake, steer": [1] * 4, "brake": [2] * 4, "idle": [2] * 4}
-    assert np.all(study.crashed(scenes["idle"]))
-    assert not np.any(study.crashed(scenes["steer"]))
+    kinds = {name: np.asarray(road_scenes.behaviour(seen)).tolist() for name, seen in scenes.items()}
+    assert kinds == {"steer": [0] * 4, "brake, steer": [1] * 4, "brake": [2] * 4, "idle": [3] * 4}
+    assert np.all(road_scenes.crashed(scenes["idle"]))
+    assert not np.any(road_scenes.crashed(scenes["steer"]))
 
 
 def test_a_human_on_a_dry_road_likes_braking_best_and_swerving_late_more_than_at_once():
-    human = study.road("highway-dry")
-    person = jax.tree.map(lambda leaf: leaf[0], study.recruit(jax.random.key(0), 1))
+    human = road_scenes.road("highway-dry")
+    person = jax.tree.map(lambda leaf: leaf[0], participants.recruit(jax.random.key(0), 1))
     want = human.task()[2]
     person = person.replace(
         ratings=want.ratings, lane_change_cost=want.lane_change_cost, swerve_cost=want.swerve_cost,
         dry_share=jnp.ones(()),
     )  # fmt: skip
     dry = jax.jit(
-        lambda plan: study.worth(
+        lambda plan: ratings.worth(
             person,
-            study.watch(lambda observation, key, time: jnp.repeat(plan[time], 16), human, jax.random.key(0), 16),
+            road_scenes.watch(lambda observation, key, time: jnp.repeat(plan[time], 16), human, jax.random.key(0), 16),
             human,
         )
     )
@@ -110,10 +129,10 @@ def test_a_human_on_a_dry_road_likes_braking_best_and_swerving_late_more_than_at
 
 
 def test_ratings_follow_the_participants_own_worth(scenes):
-    config = study.road("highway-rain")
+    config = road_scenes.road("highway-rain")
     shown = jax.tree.map(lambda *rows: jnp.concatenate([row[:1] for row in rows]), *scenes.values())
-    people = study.recruit(jax.random.key(4), 200)
-    ratings = np.asarray(jax.jit(lambda: study.rate(jax.random.key(5), people, shown, config))())
+    people = participants.recruit(jax.random.key(4), 200)
+    ratings = np.asarray(jax.jit(lambda: ratings.rate(jax.random.key(5), people, shown, config))())
     assert ratings.shape == (200, 4)
     assert set(np.unique(ratings)) <= set(range(1, 11))
     crash = list(PLANS).index("idle")
@@ -123,7 +142,7 @@ def test_ratings_follow_the_participants_own_worth(scenes):
 
 
 def test_analysis_of_variance_by_hand():
-    group = study.analyse(
+    group = ratings.analyse(
         {"peps": np.array([8.0, 9, 10]), "sac": np.array([5.0, 6, 7]), "drlhp": np.array([2.0, 3, 4])}
     )
     # between: 3 * (3^2 + 0 + 3^2) = 54 on 2 degrees of freedom; within: 6 on 6; F = 27
@@ -134,19 +153,22 @@ def test_analysis_of_variance_by_hand():
 
 def test_groups_of_raters(scenes):
     named = {"peps": scenes["brake, steer"], "sac": scenes["steer"], "drlhp": scenes["idle"]}
-    found = study.groups(jax.random.key(0), named, study.road("highway-rain"), number=3)
+    found = ratings.groups(jax.random.key(0), named, road_scenes.road("highway-rain"), number=3)
     assert len(found) == 3
     assert all(min(group.mean, key=group.mean.get) == "drlhp" for group in found)
-    findings = study.Findings(named, {}, {}, found).summary()
-    assert json.loads(json.dumps(findings))["groups"] == 3
-    renamed = study.groups(
-        jax.random.key(0), dict(zip("abc", named.values(), strict=True)), study.road("highway-rain"), 3
+    findings = experiment.Findings(named, {}, {}, found)
+    assert json.loads(json.dumps(report.summary(findings)))["groups"] == 3
+    assert report.shares(findings)["highest"] == np.mean(
+        [max(group.mean, key=group.mean.get) == "peps" for group in found]
+    )
+    renamed = ratings.groups(
+        jax.random.key(0), dict(zip("abc", named.values(), strict=True)), road_scenes.road("highway-rain"), 3
     )
     assert [list(group.mean.values()) for group in renamed] == [list(group.mean.values()) for group in found]
 
 
 def test_pictures(scenes, tmp_path):
-    shown = {name: study.typical(seen) for name, seen in scenes.items()}
+    shown = {name: road_scenes.typical(seen) for name, seen in scenes.items()}
     film.strips(shown, "a note").savefig(tmp_path / "strips.png")
     film.animate({"steer": shown["steer"]}, tmp_path / "film.gif")
     from PIL import Image
@@ -158,18 +180,91 @@ def test_pictures(scenes, tmp_path):
 
 
 def test_a_moment_lies_between_two_steps(scenes):
-    scene = study.typical(scenes["steer"])
+    scene = road_scenes.typical(scenes["steer"])
     early, middle, late = (film.moment(scene, time) for time in (1.0, 1.5, 2.0))
     np.testing.assert_allclose(middle.x, (early.x + late.x) / 2)
-    wreck = film.moment(study.typical(scenes["idle"]), 20.0)
+    wreck = film.moment(road_scenes.typical(scenes["idle"]), 20.0)
     assert wreck.crashed.all()
 
 
+def test_conduct_counts_seeds_and_leaves_out_who_failed():
+    seen = experiment.Seen(
+        scenes=None,
+        kind=np.array([[1, 1, 1, 0], [0, 0, 0, 0], [2, 2, 2, 2]]),
+        crashed=np.array([[False] * 4, [False, False, False, True], [True] * 4]),
+        return_=np.array([[6.0] * 4, [7.0] * 4, [np.nan] * 4]),
+        finite=np.array([True, True, False]),
+    )
+    found = experiment.conduct(seen)
+    assert (found.seeds_that(0), found.seeds_that(1), found.seeds_that(2), found.failed) == (1, 1, 0, 1)
+    assert found.shares == [[0.25, 0.75, 0, 0], [1, 0, 0, 0]]
+    assert found.crash_rate == [0, 0.25]
+    assert found.return_ == [6, 7]
+
+
+def test_the_studys_lambda_has_all_seeds_and_others_few():
+    own, seeds = experiment.SETTINGS["lam"], range(3, 13)
+    peps, sac, sweep = experiment.parts(seeds, 80, lams=(0.0, own, 8.0), names=("peps", "sac"))
+    assert (peps.lams, sac.lams, sweep.lams) == ((own,), (own,), (0.0, 8.0))
+    assert (peps.seeds, sweep.seeds) == (tuple(seeds), tuple(seeds[: experiment.FEW_SEEDS]))
+    asked = [(float(config.lam), config.seed) for config in sweep.configs]
+    assert asked == [(lam, seed) for lam in (0.0, 8.0) for seed in sweep.seeds]
+    assert len(experiment.parts(seeds, 80, lams=())) == len(experiment.METHODS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        ("--seeds 0", ("seeds 0", "choose 1 to")),
+        ("--seeds few", ("--seeds", "'few' is not a whole number")),
+        ("--seed -1", ("seed -1", "choose 0 to")),
+        ("--steps 0", ("total_steps 0", "from 1 on")),
+        ("--lams 1 -2", ("lams -2", "choose 0 or more")),
+        ("--lams nan", ("lams nan", "choose 0 or more")),
+        ("--lam 2", ("'--lam'", "did you mean --lams?")),
+    ],
+)
+def test_bad_input_is_one_line(arguments, parts, tmp_path, capsys):
+    try:
+        code = command.main([*arguments.split(), "--out", str(tmp_path / "out")])
+    except SystemExit as exit:
+        code = exit.code
+    assert code == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith(f"{command.PROG}: error: ")
+    assert captured.err.count("\n") == 1
+    assert all(part in captured.err for part in parts), captured.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_another_study_is_never_replaced_unasked(tmp_path, capsys, monkeypatch):
+    (tmp_path / report.TABLE).write_text("precious")
+    assert command.main(["--out", str(tmp_path)]) == 2
+    assert "holds another study" in capsys.readouterr().err
+    assert (tmp_path / report.TABLE).read_text() == "precious"
+    assert command.request(["--out", str(tmp_path), "--overwrite"]).out == tmp_path
+
+
 @pytest.mark.slow
-def test_a_small_study_from_end_to_end(tmp_path, monkeypatch):
+def test_a_small_study_from_end_to_end(tmp_path, monkeypatch, capsys):
     small = dict(num_envs=4, rollout_length=10, warmup_steps=40, batch_size=16, hidden_sizes=(8,), num_queries=20)
-    monkeypatch.setattr(study, "SETTINGS", study.SETTINGS | small)
-    summary = study.figure3(tmp_path, seeds=[0], steps=80, methods=("peps", "sac"))
-    assert {path.name for path in tmp_path.iterdir()} == {"figure3.png", "figure3.gif", "study.json"}
-    assert set(summary["ratings"]["mean"]) == {"peps", "sac"}
-    assert summary["groups"] == study.GROUPS
+    monkeypatch.setattr(experiment, "SETTINGS", experiment.SETTINGS | small)
+    monkeypatch.setattr(experiment, "EPISODES", 8)
+    monkeypatch.setattr(experiment, "METHODS", ("peps", "sac"))
+    assert command.main(["--seeds", "1", "--steps", "80", "--lams", "0", "--out", str(tmp_path)]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == set(command.FILES)
+    numbers = json.loads((tmp_path / report.NUMBERS).read_text())
+    assert set(numbers["ratings"]["mean"]) == {"peps", "sac"}
+    assert [line["lam"] for line in numbers["over_lam"]] == [0.0, experiment.SETTINGS["lam"]]
+    assert (tmp_path / report.TABLE).read_text() in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_an_agent_is_taught_all_answers(given):
+    answers = jax.tree.map(lambda rows: rows[:21], given)
+    small = dict(num_envs=4, rollout_length=10, warmup_steps=40, batch_size=16, hidden_sizes=(8,), num_queries=21)
+    config = experiment.settings("drlhp", 0, 80, **small)
+    taught = jax.jit(experiment.taught)(config, answers).knowledge.surrogate
+    np.testing.assert_array_equal(taught.answers[:21], answers.answers)
+    np.testing.assert_array_equal(taught.mask[:21], answers.segments.mask)
+    assert taught.weights[21:].sum() == 0, "what fills up the last round doesn't count"

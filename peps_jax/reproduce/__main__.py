@@ -16,18 +16,20 @@ from pathlib import Path
 from typing import NamedTuple
 
 from peps_envs.registry import unknown_name
+from peps_jax.command_line import Parser, options, refuse, use_every_core
 from peps_jax.config import Config
-from peps_jax.reproduce import figures, tables
+from peps_jax.files import NotWrittenError
+from peps_jax.reproduce import driving, figures, tables
 from peps_jax.reproduce.store import Store
 from peps_jax.reproduce.study import DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
-from peps_jax.sweep import Parser, options, use_every_core
+from peps_jax.study.experiment import STEPS
 
 PROG = "python -m peps_jax.reproduce"
 MOST = 1000  # seeds
 DESCRIPTION = f"""\
 The paper's evaluation: {", ".join(METHODS)} on {", ".join(DOMAINS)},
-each with every seed, and the known-model planner beside them. Trainings are kept in
-the folder: a stopped command continues where it was, and results share them."""
+each with every seed, and the known-model planner beside them; and the driving study
+(figure3). Trainings are kept in the folder: a stopped command continues where it was, and results share them."""
 
 
 class Result(NamedTuple):
@@ -42,10 +44,12 @@ RESULTS = {
     "table1": Result("return and explicability of every method", tables.table1_needs, tables.table1),
     "figure1": Result("the learned surrogate reward beside the true one", figures.figure1_needs, figures.figure1),
     "figure2": Result("rollouts of every method", figures.figure2_needs, figures.figure2),
+    "figure3": Result("behaviours and ratings in the driving study", driving.figure3_needs, driving.figure3),
     "frontier": Result("return and explicability over lambda", figures.frontier_needs, figures.frontier),
     "queries": Result("explicability over the number of queries", figures.queries_needs, figures.queries),
     "ablations": Result("PEPS and DRLHP without parts of them", tables.ablations_needs, tables.ablations),
 }
+GROUPS = {"paper": ("table1", "figure1", "figure2"), "all": tuple(RESULTS)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,16 +64,18 @@ class Request:
 def parser() -> Parser:
     """The command line's parser."""
     texts = "\n".join(f"  {name:10} {result.text}" for name, result in RESULTS.items())
-    epilog = f"results:\n{texts}\n  {'all':10} all of them\n\nThe last three take the first {FEW_SEEDS} seeds."
+    groups = "\n".join(f"  {name:10} {', '.join(members)}" for name, members in GROUPS.items())
+    epilog = f"results:\n{texts}\n{groups}\n\nfrontier, queries and ablations take the first {FEW_SEEDS} seeds."
     made = Parser(
         prog=PROG, usage=f"{PROG} [RESULT ...] [flags]", description=DESCRIPTION, epilog=epilog, allow_abbrev=False,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    made.add_argument("results", nargs="*", default=["all"], metavar="RESULT", help="what to reproduce [all]")
+    made.add_argument("results", nargs="*", default=["paper"], metavar="RESULT", help="what to reproduce [paper]")
     made.add_argument("--out", default="results/reproduce", metavar="DIR", help="folder [results/reproduce]")
     made.add_argument("--seeds", default=10, help="trainings of each method in each domain [10]", **options(10))
     steps = Config().total_steps
-    made.add_argument("--steps", default=None, help=f"environment steps of a training [{steps}]", **options(steps))
+    text = f"environment steps of a training [{steps}, and {STEPS} of the driving study's]"
+    made.add_argument("--steps", default=None, help=text, **options(steps))
     return made
 
 
@@ -82,19 +88,21 @@ def request(arguments: Sequence[str], base: Config, num_episodes: int) -> Reques
     """
     values = parser().parse(arguments)
     for name in values.results:
-        if name not in (*RESULTS, "all"):
-            raise ValueError(unknown_name("result", name, (*RESULTS, "all")))
+        if name not in (*RESULTS, *GROUPS):
+            raise ValueError(unknown_name("result", name, (*RESULTS, *GROUPS)))
     if not 2 <= values.seeds <= MOST:
         raise ValueError(f"seeds {values.seeds} is out of range: choose 2 to {MOST} (an interval needs two)")
     base = base if values.steps is None else base.replace(total_steps=values.steps)
     base.check()
-    names = tuple(RESULTS) if "all" in values.results else tuple(dict.fromkeys(values.results))
+    names = tuple(dict.fromkeys(each for name in values.results for each in GROUPS.get(name, (name,))))
     made = Request(
         names, Study(base, values.seeds, num_episodes), Store(Path(values.out), base, num_episodes, values.seeds)
     )
     wanted = [what for name in names for what in RESULTS[name].needs(made.study)]
     missing = made.study.missing(wanted, made.store)
     made.study.batches([what for what in missing if isinstance(what, Training)][:1])  # to see, early, that one fits
+    if "figure3" in names:
+        driving.check(made.study, made.store.folder)
     made.store.open()
     return made
 
@@ -106,7 +114,8 @@ def run(wanted: Request) -> list[Path]:
         needs = RESULTS[name].needs(wanted.study)
         missing = wanted.study.missing(needs, wanted.store)
         number = len({what.name for what in needs})
-        print(f"{name}: {number - len(missing)} of {number} trainings and plans are there", file=sys.stderr, flush=True)
+        there = f"{number - len(missing)} of {number} trainings and plans are there" if number else "the driving study"
+        print(f"{name}: {there}", file=sys.stderr, flush=True)
         wanted.study.make(missing, wanted.store)
         written += RESULTS[name].write(wanted.study, wanted.store.folder)
     return written
@@ -124,9 +133,8 @@ def main(arguments: Sequence[str] | None = None, base: Config | None = None, num
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         wanted = request(arguments, Config() if base is None else base, num_episodes)
-    except ValueError as error:
-        print(f"{PROG}: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+    except (ValueError, NotWrittenError) as error:
+        return refuse(PROG, error)
     try:
         written = run(wanted)
     except KeyboardInterrupt:
@@ -134,6 +142,8 @@ def main(arguments: Sequence[str] | None = None, base: Config | None = None, num
             f"\nstopped: what is finished is kept in {wanted.store.folder}; the same command continues", file=sys.stderr
         )
         return 130
+    except NotWrittenError as error:
+        return refuse(PROG, f"{error}; what is finished is kept, and the same command continues")
     for path in written:
         if path.suffix == ".md":
             print(path.read_text())

@@ -1,0 +1,81 @@
+"""Figure 3: the driving study. What each of its programs trained is kept, so that a stopped command continues."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import jax
+import numpy as np
+
+import peps_envs
+from peps_jax import files, study
+from peps_jax.config import Config
+from peps_jax.reproduce.store import CELLS, digest, settings_of
+from peps_jax.reproduce.study import Study
+from peps_jax.study import experiment, report
+from peps_jax.study.experiment import Part, Seen
+
+# what decides the numbers beside the trainings' own code, which the folder's head has
+CODE = (Path(study.__file__).parent, Path(peps_envs.__file__).parent / "highway")
+
+
+def figure3_needs(made: Study) -> list:
+    """None of the trainings that tables and figures share."""
+    del made
+    return []
+
+
+def figure3(made: Study, folder: Path) -> list[Path]:
+    """figure3.{md,json,png,gif}: behaviours, crashes and ratings of every method, and PEPS over lambda."""
+    return report.write(experiment.run(_parts(made), make=lambda part: _make(part, folder)), folder)
+
+
+def check(made: Study, folder: Path) -> None:
+    """Raises ValueError if a file of `folder` can't be read, or something else than this study made it."""
+    for part in _parts(made):
+        if _path(part, folder).exists():
+            _leaves(part, folder)
+
+
+def _parts(made: Study) -> list[Part]:
+    own = made.base.total_steps == Config().total_steps  # a length that was asked for is the study's too
+    return experiment.parts(range(made.seeds), experiment.STEPS if own else made.base.total_steps)
+
+
+def _path(part: Part, folder: Path) -> Path:
+    return folder / CELLS / f"driving-{part.name.replace(' ', '-')}-{len(part.seeds)}-seeds.npz"
+
+
+def _digest(part: Part) -> str:
+    code = {file.name: file.read_text() for folder in CODE for file in sorted(folder.glob("*.py"))}
+    return digest([settings_of(config) for config in part.configs], part.episodes, code)
+
+
+def _leaves(part: Part, folder: Path) -> list[np.ndarray]:
+    path = _path(part, folder)
+    try:
+        with np.load(io.BytesIO(path.read_bytes())) as file:
+            arrays = dict(file)
+        found = str(arrays.pop("digest"))
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
+        raise ValueError(f"file {str(path)!r} can't be read: remove it, and it is made again") from None
+    if found != _digest(part):
+        raise ValueError(f"file {str(path)!r} was made with other settings or code: choose another folder")
+    return [arrays[str(place)] for place in range(len(arrays))]
+
+
+def _make(part: Part, folder: Path) -> Seen:
+    """What `part`'s agents were seen to do: from its file, or trained now and kept in it."""
+    path = _path(part, folder)
+    if path.exists():
+        like = jax.eval_shape(lambda config: experiment.learn(config, part.episodes), part.configs[0])
+        return jax.tree.unflatten(jax.tree.structure(like), _leaves(part, folder))
+    seen = experiment.run_part(part)
+    buffer = io.BytesIO()
+    arrays = {str(place): leaf for place, leaf in enumerate(jax.tree.leaves(seen))}
+    np.savez_compressed(buffer, digest=np.array(_digest(part)), **arrays)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files.write_whole(path, buffer.getvalue())
+    return seen

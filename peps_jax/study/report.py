@@ -1,0 +1,94 @@
+"""The study's files: what was found as tables and numbers, film strips, and a film."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from peps_jax import files, film
+from peps_jax.study.experiment import SETTINGS, Conduct, Findings
+from peps_jax.study.ratings import RATERS
+from peps_jax.study.scenes import BEHAVIOURS, typical
+
+PICTURE, FILM, NUMBERS, TABLE = "figure3.png", "figure3.gif", "figure3.json", "figure3.md"
+TITLES = {"peps": "PEPS", "sac": "SAC", "drlhp": "DRLHP", "policy_shaping": "policy shaping"}
+# Gong and Zhang 2021, Figure 3: mean and standard deviation of 15 ratings; p = 0.037
+PAPER = {"peps": (7.6, 2.4), "sac": (5.0, 2.3), "drlhp": (5.9, 2.2)}
+
+
+def shares(findings: Findings) -> dict[str, float]:
+    """How many groups of raters rate PEPS highest, how many differ significantly, and both, from 0 to 1."""
+    highest = np.array([max(group.mean, key=group.mean.get) == "peps" for group in findings.groups])
+    significant = np.array([group.p < 0.05 for group in findings.groups])
+    both = highest & significant
+    return {"highest": highest.mean(), "significant": significant.mean(), "both": both.mean()}
+
+
+def summary(findings: Findings) -> dict[str, Any]:
+    """Everything found but the scenes, as JSON knows it."""
+    return {
+        "behaviours": BEHAVIOURS,
+        "conduct": {method: found._asdict() for method, found in findings.conduct.items()},
+        "over_lam": [{"lam": lam} | found._asdict() for lam, found in findings.over_lam.items()],
+        "lam": SETTINGS["lam"],
+        "ratings": findings.groups[0]._asdict(),
+        "groups": len(findings.groups),
+        "groups_that": {name: float(share) for name, share in shares(findings).items()},
+    }
+
+
+def _behaves(found: Conduct) -> list[str]:
+    """Cells of a table: seeds with each behaviour, crashes, return."""
+    seeds = len(found.shares)
+    counted = [f"{found.seeds_that(kind)} of {seeds}" for kind in range(len(BEHAVIOURS))]
+    if not seeds:
+        return [*counted, "–", "–"]
+    failed = f" ({found.failed} failed)" * (found.failed > 0)
+    return [*counted, f"{np.mean(found.crash_rate):.1%}", f"{np.mean(found.return_):.2f}{failed}"]
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    shown = lambda cells: "| " + " | ".join(cells) + " |"
+    return "\n".join([shown(head), "|" + "---|" * len(head), *map(shown, rows)])
+
+
+def text(findings: Findings) -> str:
+    """What was found, in Markdown."""
+    rated = findings.groups[0]
+    heads = [*BEHAVIOURS, "crashes", "return"]
+    rows = []
+    for method, found in findings.conduct.items():
+        paper = "{} ± {}".format(*PAPER[method]) if method in PAPER else ""
+        rows.append([TITLES[method], *_behaves(found), f"{rated.mean[method]:.1f} ± {rated.sd[method]:.1f}", paper])
+    told = shares(findings)
+    parts = [
+        _table(["agent", *heads, "rating", "paper's rating"], rows),
+        f"Agents by what they do in most scenes. One-way ANOVA of the ratings by {RATERS} raters: "
+        f"p = {rated.p:.2g}, η² = {rated.eta_squared:.2f} (paper: p = 0.037). Of {len(findings.groups)} groups of raters "
+        f"{told['highest']:.0%} rate PEPS highest, {told['significant']:.0%} differ with p < 0.05, both in {told['both']:.0%}.",
+    ]
+    if len(findings.over_lam) > 1:
+        rows = [[f"{lam:g}", *_behaves(found)] for lam, found in findings.over_lam.items()]
+        parts += [f"PEPS over λ, of which the study's is {SETTINGS['lam']:g}:", _table(["λ", *heads], rows)]
+    return "\n\n".join(parts) + "\n"
+
+
+def write(findings: Findings, folder: Path) -> list[Path]:
+    """Writes figure3.png, .gif, .json and .md; returns the paths."""
+    rated = findings.groups[0]
+    titles = {
+        method: f"{TITLES[method]} (μ = {rated.mean[method]:.1f}, σ = {rated.sd[method]:.1f})"
+        for method in findings.scenes
+    }
+    shown = {titles[method]: typical(scenes) for method, scenes in findings.scenes.items()}
+    folder.mkdir(parents=True, exist_ok=True)
+    note = f"ratings by simulated participants; one-way ANOVA: p = {rated.p:.2g}"
+    film.strips(shown, note).savefig(folder / PICTURE, dpi=150)
+    film.animate(shown, folder / FILM)
+    numbers = json.dumps(summary(findings), indent=1, allow_nan=False) + "\n"
+    files.write_whole(folder / NUMBERS, numbers.encode())
+    files.write_whole(folder / TABLE, text(findings).encode())
+    return [folder / name for name in (TABLE, PICTURE, FILM, NUMBERS)]
