@@ -59,14 +59,17 @@ def main() -> None:
     machine = {"processor": processor(), "devices": jax.device_count(), "python": platform.python_version(),
                "jax": jax.__version__}  # fmt: skip
     record = {"quick": arguments.quick, "machine": machine}
-    record |= {section: measure(section, arguments.quick) for section in SECTIONS}
+    out.mkdir(parents=True, exist_ok=True)
+    save = lambda: (out / "speed.json").write_text(json.dumps(record, indent=1) + "\n")
+    for section in SECTIONS:
+        record[section] = measure(section, arguments.quick)
+        save()
     record["minutes"] = (time.perf_counter() - start) / 60
 
     import report
 
     record["ratios"] = report.ratios(record)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "speed.json").write_text(json.dumps(record, indent=1) + "\n")
+    save()
     (out / "speed.md").write_text(report.text(record))
     report.draw(record, out / "speed.png")
     print(report.text(record))

@@ -64,6 +64,7 @@ def ours(method: str, width: int, steps: int, cells: int, **layout: Any) -> dict
 
 def theirs(library: Library, width: int, steps: int, quick: bool) -> dict[str, Any]:
     """A peer's rate, or why there is none."""
+    print(f"{library.title} at {width}", end=", ", flush=True)
     try:
         return peer.best(library.name, library.script, ("--width", width, "--steps", steps), quick)
     except peer.Missing as error:
