@@ -1,4 +1,4 @@
-"""The NumPy world as Stable-Baselines3 wants it; for the same 16 worlds its `DummyVecEnv` takes several times as long."""
+"""The NumPy world as Stable-Baselines3 wants it; for the same 16 worlds its `DummyVecEnv` would call each by itself."""
 
 from typing import Any
 
