@@ -4,8 +4,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 ARGS ?=
+REPRODUCED ?= results/reproduce
 
-.PHONY: sweep reproduce test verify-navigation benchmark benchmark-highway readme lint lock setup
+.PHONY: sweep reproduce test verify-navigation benchmark readme publish lint lock setup
 .DEFAULT_GOAL := sweep
 
 sweep: $(READY)
@@ -21,13 +22,17 @@ test: $(READY)
 verify-navigation: $(READY)
 	$(BIN)/python benchmarks/verify_navigation.py $(ARGS)
 
+# beside other libraries, which it installs under benchmarks/.peers; ARGS="--quick" for a little of everything
 benchmark: $(READY)
 	$(BIN)/python benchmarks/speed.py $(ARGS)
 
-benchmark-highway: $(READY)
-	$(BIN)/python benchmarks/highway.py $(ARGS)
-
 readme: $(READY)
+	$(BIN)/python benchmarks/readme.py
+
+# what README shows of `make reproduce`, from its folder
+publish: $(READY)
+	cp $(filter-out %/figure1.csv %/figure2.csv,$(wildcard $(addprefix $(REPRODUCED)/,*.md *.csv figure3.json *.png *.gif))) \
+		benchmarks/results/
 	$(BIN)/python benchmarks/readme.py
 
 lint: $(READY)

@@ -1,79 +1,78 @@
-"""Environment steps a second of a sweep's cells on D1, compile time apart; writes benchmarks/results/speed.md.
+"""How fast all of it is, beside others and beside what the machine could do; writes results/speed.{json,md,png}.
 
-    make benchmark [ARGS="--cells 4 --steps 12000"]
+    make benchmark [ARGS="--quick"]
 
-16 environments, one SAC update per 4 steps, batch 256. SAC at two widths of two layers, and PEPS with its default models;
-PEPS's rate is also given as a share of SAC's in the same run, and its time and memory for growing numbers of seeds.
+Worlds alone (`worlds`), SAC beside other libraries and PEPS (`training`), the parts of a round (`rounds`), matrix products
+alone (`roof`), and what more work costs (`growth`), in one run, so that ratios mean something. Other libraries are installed on
+the first call (`peer`); one that can't be is a row that says so. `--quick` runs a little of everything, into build/benchmark.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
 import pathlib
+import platform
 import time
-from typing import NamedTuple
+from typing import Any
 
 import jax
 
-from peps_jax import Config, train
-from peps_jax.batch import compile_over_devices
-from peps_jax.sweep import use_every_core
+from peps_jax.command_line import use_every_core
 
-FOLDER = pathlib.Path(__file__).parent / "results"
-
-
-class Cost(NamedTuple):
-    """What a batch of trainings took."""
-
-    seconds: float
-    rate: float  # environment steps a second, summed over cells
-    compilation: float  # s
-    memory: float  # MB on all devices: arguments, results and what the program works with, as XLA reports them
+FOLDER = pathlib.Path(__file__).parent
+SECTIONS = ("worlds", "training", "roof", "rounds", "growth")
 
 
-def cost(config: Config, cells: int) -> Cost:
-    """Trains `cells` seeds."""
+def processor() -> str:
+    """The processor's name."""
+    try:
+        lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def measure(section: str, quick: bool) -> dict[str, Any]:
+    """One section's record."""
+    module = __import__(section)
     start = time.perf_counter()
-    program, batch = compile_over_devices(train, [config.replace(seed=seed) for seed in range(cells)])
-    compiled = time.perf_counter()
-    jax.block_until_ready(program(batch))
-    seconds = time.perf_counter() - compiled
-    steps = cells * config.num_rounds * config.steps_per_round
-    used = program.memory_analysis()
-    per_device = used.argument_size_in_bytes + used.output_size_in_bytes + used.temp_size_in_bytes
-    return Cost(seconds, steps / seconds, compiled - start, per_device * jax.device_count() / 1e6)
+    print(section, end=" ", flush=True)
+    record = module.measure(quick)
+    print(f"{time.perf_counter() - start:.0f} s", flush=True)
+    return record
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="a little of everything, whose numbers mean nothing")
     parser.add_argument(
-        "--cells", type=int, default=4, help="trainings; twice the number of devices, or a multiple of that"
+        "--out", type=pathlib.Path, help="folder to write [benchmarks/results; --quick: build/benchmark]"
     )
-    parser.add_argument("--steps", type=int, default=12_000, help="environment steps of a training")
     arguments = parser.parse_args()
     use_every_core()
-    lines = ["| training | hidden layers | environment steps a second | compilation, s |", "|---|---|---|---|"]
-    rates = {}
-    for method, width, steps in (
-        ("sac", 64, arguments.steps),
-        ("sac", 256, arguments.steps // 4),
-        ("peps", 64, arguments.steps),
-    ):
-        config = Config(env="nav-d1", method=method, hidden_sizes=(width, width), total_steps=steps)
-        taken = cost(config, arguments.cells)
-        rates[method, width] = taken.rate
-        lines.append(f"| {method} | {width}, {width} | {taken.rate:,.0f} | {taken.compilation:.1f} |")
-    lines += ["", f"PEPS runs at {rates['peps', 64] / rates['sac', 64]:.0%} of SAC's rate; {jax.device_count()} devices, "
-              f"{arguments.cells} cells."]  # fmt: skip
-    lines += ["", "| seeds of PEPS | seconds | seconds a seed | MB | MB a seed |", "|---|---|---|---|---|"]
-    for seeds in (arguments.cells // 2, arguments.cells, 2 * arguments.cells, 4 * arguments.cells):
-        taken = cost(Config(env="nav-d1", total_steps=arguments.steps), seeds)
-        lines.append(
-            f"| {seeds} | {taken.seconds:.1f} | {taken.seconds / seeds:.2f} | {taken.memory:.0f} | {taken.memory / seeds:.0f} |"
-        )
-    FOLDER.mkdir(exist_ok=True)
-    (FOLDER / "speed.md").write_text("\n".join(lines) + "\n")
-    print("\n".join(lines))
+    if arguments.quick:  # nearly all of its time is compilation
+        os.environ["XLA_FLAGS"] += " --xla_backend_optimization_level=0"
+    out = arguments.out or (FOLDER.parent / "build/benchmark" if arguments.quick else FOLDER / "results")
+    start = time.perf_counter()
+    machine = {"processor": processor(), "devices": jax.device_count(), "python": platform.python_version(),
+               "jax": jax.__version__}  # fmt: skip
+    record = {"quick": arguments.quick, "machine": machine}
+    out.mkdir(parents=True, exist_ok=True)
+    save = lambda: (out / "speed.json").write_text(json.dumps(record, indent=1) + "\n")
+    for section in SECTIONS:
+        record[section] = measure(section, arguments.quick)
+        save()
+    record["minutes"] = (time.perf_counter() - start) / 60
+
+    import report
+
+    record["ratios"] = report.ratios(record)
+    save()
+    (out / "speed.md").write_text(report.text(record))
+    report.draw(record, out / "speed.png")
+    print(report.text(record))
 
 
 if __name__ == "__main__":

@@ -31,11 +31,11 @@ class Plan(NamedTuple):
     policy: Policy  # greedy, one exact step ahead of the grid's values
 
 
-def _actions(directions: int) -> np.ndarray:
+def _actions(directions: int, full_action: Array) -> Array:
     """Full and half steps in `directions` directions, and standing still: (2 * directions + 1, 2)."""
     angles = 2 * np.pi * np.arange(directions) / directions
     full = np.stack([np.cos(angles), np.sin(angles)], -1)
-    return np.concatenate([full, full / 2, np.zeros((1, 2))])
+    return full_action * jnp.asarray(np.concatenate([full, full / 2, np.zeros((1, 2))]), jnp.float32)
 
 
 def _corners(position: Array, resolution: int, size: Array) -> tuple[Array, Array]:
@@ -80,7 +80,7 @@ def solve(
         raise ValueError(unknown_name("objective", objective, OBJECTIVES))
     world = Navigation()
     acting = belief if objective == "human" else params
-    actions = jnp.asarray(_actions(directions), jnp.float32)
+    actions = _actions(directions, params.full_action)
 
     def gain(state: NavigationState, action: Array, position: Array) -> Array:
         after = NavigationState(position, state.time + 1)

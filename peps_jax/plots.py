@@ -6,6 +6,7 @@ Each function makes one figure, or returns None where it has nothing to show; `d
 from __future__ import annotations
 
 import functools
+import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from peps_envs.navigation import Navigation, NavigationParams, NavigationState
-from peps_jax import methods
+from peps_jax import files, methods
 from peps_jax.config import Config
 from peps_jax.parts import human, surrogate
 from peps_jax.results import PICTURES, Row
@@ -371,11 +372,13 @@ def draw_heat(figure: Figure, axes: Axes, values: np.ndarray, params: Navigation
 
 
 def draw(rows: Sequence[Row], folder: Path) -> list[Path]:
-    """Writes every picture that `rows` have something for."""
+    """Writes every picture that `rows` have something for. Raises NotWrittenError."""
     written = []
     for name, make in zip(PICTURES, (learning_curves, frontier, routes, surrogate_maps), strict=True):
         figure = make(rows)
         if figure is not None:
-            figure.savefig(folder / name, dpi=DOTS)
+            picture = io.BytesIO()
+            figure.savefig(picture, dpi=DOTS, format="png")
+            files.write_whole(folder / name, picture.getvalue())
             written.append(folder / name)
     return written

@@ -3,8 +3,9 @@
     manifest.json    command, settings, versions, devices, times, cells
     results.csv      one row for each cell of the grid
     curves.npz       `env_steps` (rounds,), and every curve (cells, rounds) in the order of the rows; nan where a method has none
-    cells/*.msgpack  what each training learned
+    cells/*.msgpack  what each training learned and how it was evaluated, behind a line with the file's checksum
     *.png            pictures, see `peps_jax.plots`
+    progress/        how far an unfinished sweep is, see `peps_jax.ledger`
 
 A method that doesn't use lambda is trained once for each environment and seed; its rows for the grid's lambdas share that
 training's numbers and file.
@@ -21,7 +22,6 @@ import json
 import math
 import os
 import platform
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,7 +31,8 @@ import jax
 import numpy as np
 
 from peps_envs.registry import unknown_name
-from peps_jax.batch import Finished, Times
+from peps_jax import files
+from peps_jax.batch import Finished, Times, empty_finished
 from peps_jax.config import Config
 from peps_jax.evaluate import Evaluation
 from peps_jax.train import Result, init
@@ -103,41 +104,32 @@ def record(row: Row) -> dict[str, Any]:
 # --- writing --------------------------------------------------------------------------------------------------------------
 
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Writes a file so that a reader sees the old one or the new one, never a half."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-        try:
-            file.write(content)
-            file.flush()
-            os.chmod(file.name, 0o644)  # a temporary file is its owner's alone
-            os.replace(file.name, path)
-        except BaseException:
-            os.unlink(file.name)
-            raise
+def write_cell(folder: Path, training: str, finished: Finished) -> str:
+    """Writes what a training left; returns the file's checksum. Raises NotWrittenError."""
+    path = folder / CELLS / f"{training}.msgpack"
+    files.make_folder(path.parent)
+    content = files.seal(_learned(finished))
+    files.write_whole(path, content)
+    return files.digest(content)
 
 
 class Writer:
-    """Writes a sweep's folder. `save` may come after every batch; what it wrote stays valid if nothing follows."""
+    """Writes what a sweep's folder tells of its finished cells. `save` may come at any time; the folder is valid after each.
+
+    Raises:
+      NotWrittenError: there is no room, or no permission.
+    """
 
     def __init__(self, folder: Path, command: str, settings: Mapping[str, Any]):
         self.folder = folder
         self._head = {"command": command, "configuration": plain(settings)} | machine()
-        self._trainings: set[str] = set()
 
     def save(self, rows: Sequence[Row], times: Times, env_steps: int, status: str) -> None:
-        """Writes the rows finished so far; `status` is "running", "complete" or "interrupted".
-
-        The first time, it takes the place of what an earlier sweep wrote here; other files stay.
-        """
-        if not self._trainings:
-            _clear(self.folder)
-        (self.folder / CELLS).mkdir(parents=True, exist_ok=True)
-        for row in rows:
-            if row.cell.training not in self._trainings:
-                write_whole(self.folder / row.cell.file, _learned(row.finished.result))
-                self._trainings.add(row.cell.training)
-        write_whole(self.folder / CURVES, _curves(rows))
-        write_whole(self.folder / TABLE, table([record(row) for row in rows]))
+        """Writes the tables of the rows finished so far; `status` is "running", "complete" or "interrupted"."""
+        files.make_folder(self.folder)
+        if rows:
+            files.write_whole(self.folder / CURVES, _curves(rows))
+            files.write_whole(self.folder / TABLE, table([record(row) for row in rows]))
         manifest = self._head | {
             "status": status,
             "compile_seconds": round(times.compile, 3),
@@ -147,16 +139,15 @@ class Writer:
             "env_steps_per_second": round(env_steps / times.run, 1) if times.run else 0.0,
             "cells": [_entry(row) for row in rows],
         }
-        write_whole(self.folder / MANIFEST, (json.dumps(manifest, indent=1, allow_nan=False) + "\n").encode())
+        files.write_whole(self.folder / MANIFEST, files.json_bytes(manifest))
 
 
-def _clear(folder: Path) -> None:
-    """Removes an earlier sweep's files."""
-    if holds_results(folder):
-        for path in (folder / MANIFEST, folder / TABLE, folder / CURVES):
-            path.unlink(missing_ok=True)
-        for path in (*(folder / CELLS).glob("*.msgpack"), *(folder / name for name in PICTURES)):
-            path.unlink(missing_ok=True)
+def clear(folder: Path) -> None:
+    """Removes a sweep's files; others stay. The manifest goes first: without it nothing is taken for results."""
+    for name in (MANIFEST, TABLE, CURVES, *PICTURES):
+        (folder / name).unlink(missing_ok=True)
+    for path in (folder / CELLS).glob("*.msgpack"):
+        path.unlink(missing_ok=True)
 
 
 def machine() -> dict[str, Any]:
@@ -188,8 +179,9 @@ def _entry(row: Row) -> dict[str, Any]:
     return {"name": cell.name} | {key: getattr(cell, key) for key in KEYS} | {"file": cell.file}
 
 
-def _learned(result: Result) -> bytes:
+def _learned(finished: Finished) -> bytes:
     """What a training leaves; the world's numbers too, so that it is evaluated in the world it was trained in."""
+    result = finished.result
     _, params, belief = result.config.task()
     parts = {
         "agents": result.agents,
@@ -197,8 +189,34 @@ def _learned(result: Result) -> bytes:
         "curves": result.curves,
         "params": params,
         "belief": belief,
+        "evaluation": finished.evaluation,
+        "failed": finished.failed,
     }
     return flax.serialization.to_bytes(jax.tree.map(np.asarray, parts))
+
+
+def read_cell(folder: Path, training: str, config: Config, num_episodes: int, checksum: str) -> Finished:
+    """What `write_cell` was given.
+
+    Raises:
+      DamagedError: the file isn't the one with that checksum.
+    """
+    try:
+        content = (folder / CELLS / f"{training}.msgpack").read_bytes()
+    except OSError:
+        raise files.DamagedError("it is missing") from None
+    if files.digest(content) != checksum:
+        raise files.DamagedError("its checksum is wrong")
+    stored = flax.serialization.msgpack_restore(files.unseal(content))
+    result, evaluation = empty_finished(config, num_episodes)
+    restore = flax.serialization.from_state_dict
+    result = result.replace(
+        agents=restore(result.agents, stored["agents"]),
+        knowledge=restore(result.knowledge, stored["knowledge"]),
+        curves=stored["curves"],
+        config=config,
+    )
+    return Finished(result, restore(evaluation, stored["evaluation"]), bool(stored["failed"]))
 
 
 def _curves(rows: Sequence[Row]) -> bytes:
@@ -249,11 +267,15 @@ def load(folder: str | os.PathLike[str], cell: int | str | Mapping[str, Any]) ->
     empty = {"agents": shapes.agents, "knowledge": shapes.knowledge, "params": params, "belief": belief}
     path = folder / entry["file"]
     try:
-        stored = flax.serialization.msgpack_restore(path.read_bytes())
+        content = path.read_bytes()
+        stored = flax.serialization.msgpack_restore(files.unseal(content) if files.is_sealed(content) else content)
         curves = stored.pop("curves")
+        stored = {name: value for name, value in stored.items() if name in empty}
         parts = flax.serialization.from_state_dict(empty, stored)
     except OSError:
         raise ValueError(f"file {str(path)!r} is missing: the folder is incomplete; run the sweep again") from None
+    except files.DamagedError as error:
+        raise ValueError(f"file {str(path)!r} is damaged ({error}): run the sweep again") from None
     except (ValueError, KeyError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"file {str(path)!r} was written by a version that doesn't fit this one: {reason}") from None
@@ -285,13 +307,21 @@ def _find(cells: Sequence[Mapping[str, Any]], wanted: int | str | Mapping[str, A
 
 
 def _config(configuration: Mapping[str, Any], entry: Mapping[str, Any]) -> Config:
-    """A cell's `Config`: the sweep's settings, and what is the cell's own. Lists are tuples again, text for a number is one."""
+    """A cell's `Config`: the sweep's settings, and what is the cell's own."""
+    own = {key: value for key, value in entry.items() if key in KEYS}
+    values = tuples({name: value for name, value in configuration.items() if name not in KEYS} | own)
+    names = {
+        field.name for field in dataclasses.fields(Config)
+    }  # an older folder may lack one, a newer one may have more
+    return Config(**{name: value for name, value in values.items() if name in names})
+
+
+def tuples(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as `plain` was given them: lists are tuples again, text for a number is one."""
+    defaults = {field.name: field.default for field in dataclasses.fields(Config)}
     values = {}
-    for field in dataclasses.fields(Config):
-        source = entry if field.name in KEYS else configuration
-        if field.name in source:  # an older folder may lack a setting, a newer one may have more
-            value = source[field.name]
-            if isinstance(field.default, float) and isinstance(value, str):
-                value = float(value)
-            values[field.name] = tuple(value) if isinstance(value, list) else value
-    return Config(**values)
+    for name, value in configuration.items():
+        if isinstance(defaults.get(name), float) and isinstance(value, str):
+            value = float(value)
+        values[name] = tuple(value) if isinstance(value, list) else value
+    return values

@@ -1,393 +1,259 @@
 """The command line: trains every cell of a grid of worlds, methods, lambdas and seeds, and writes a results folder.
 
     python -m peps_jax.sweep --env nav-d1 nav-d4 --method peps sac --lam 2.0 2.4 2.8 --seeds 8 --out results/mine
+    python -m peps_jax.sweep --resume --out results/mine
 
 Cells that share a structure run as one program over all devices; see `peps_jax.batch`, and `peps_jax.results` for what the
 folder holds. Every field of `Config` is a flag. Bad input gets one line on stderr and exit code 2 before anything compiles.
-Ctrl-C keeps the batches that are finished, with exit code 130.
+Ctrl-C keeps the batches that are finished, with exit code 130; SIGTERM also makes a checkpoint of the one under way, with
+exit code 143. After either, or a kill, `--resume` continues, and gets the numbers of a sweep that was never stopped.
 """
 
 from __future__ import annotations
 
-import argparse
-import dataclasses
-import difflib
-import itertools
-import os
+import contextlib
+import json
 import shlex
-import shutil
+import signal
 import sys
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
 
+import jax
 import numpy as np
 
-import peps_envs
-from peps_jax import batch, methods, results
-from peps_jax.config import Config
-from peps_jax.results import Cell, Row
-from peps_jax.train import check
-
-PROG = "python -m peps_jax.sweep"
-FORCED_DEVICES = "--xla_force_host_platform_device_count"
-MOST = 100_000  # seeds, and evaluation episodes
-PATIENCE = 10.0  # s between two lines of progress where there is no terminal
-GRID = ("env", "method", "lam")  # fields of which a sweep takes several values
-DEMONSTRATION = {"env": ("nav-d1", "nav-d4"), "method": ("peps", "sac"), "lam": (2.4,)}
-
-DESCRIPTION = """\
-Trains every cell of a grid of worlds, methods, lambdas and seeds, side by side on all
-devices, and writes tables, curves, learned parameters and pictures into a folder.
-Without flags: a demonstration of a few minutes."""
-
-EPILOG = """\
-A method that doesn't use lambda (any but peps) is trained once for each world and seed; its row is
-repeated for every lambda, so that the table holds the whole grid.
-
-examples:
-  python -m peps_jax.sweep
-  python -m peps_jax.sweep --env nav-d1 nav-d4 --lam 2.0 2.4 2.8 --seeds 8 --out results/mine
-  python -m peps_jax.sweep --env nav-d2 --belief unbiased --hidden-sizes 128 128 --out results/wide"""
-
-TITLES = {
-    "task": "task",
-    "objective": "objective, Eq. (6)",
-    "run": "size of a training",
-    "sac": "soft actor-critic",
-    "models": "learned dynamics and surrogate reward",
-    "queries": "preferences",
-    "human": "the synthetic human",
-}
+from peps_jax import batch, checkpoint, files, ledger, processes, results
+from peps_jax.command_line import refuse, use_every_core
+from peps_jax.progress import Display, env_steps, print_table
+from peps_jax.request import PROG, Request, read
+from peps_jax.results import Row
 
 
-@dataclasses.dataclass(frozen=True)
-class Request:
-    """What a command line asks for, checked."""
-
-    cells: list[Cell]  # the grid, in the order of the table
-    trainings: dict[str, Config]  # by name; several cells may show one
-    settings: dict[str, Any]  # every flag's value
-    episodes: int  # of an evaluation
-    out: Path
-
-
-def use_every_core() -> None:
-    """Asks JAX for one device per usable core of a CPU, unless the caller asked for a number. Before JAX meets its devices."""
-    flags = os.environ.get("XLA_FLAGS", "")
-    if FORCED_DEVICES not in flags:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        os.environ["XLA_FLAGS"] = f"{flags} {FORCED_DEVICES}={cores}".strip()
-
-
-# --- what is asked for ----------------------------------------------------------------------------------------------------
-
-
-class Parser(argparse.ArgumentParser):
-    """Complains in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: error: {' '.join(message.removeprefix('argument ').split())}\n")
-
-    def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
-        """Like `parse_args`, but says which flag was meant."""
-        values, unknown = self.parse_known_args(arguments)
-        for argument in unknown:
-            name = argument.split("=")[0]
-            nearest = difflib.get_close_matches(name, self._option_string_actions, n=1)
-            hint = f"did you mean {nearest[0]}? " if nearest and name.startswith("-") else ""
-            self.error(f"flag {name!r} is unknown: {hint}--help lists them all")
-        return values
-
-
-def _number(kind: type, example: Any) -> Callable[[str], Any]:
-    """Reads an int or a float, and says what would be one."""
-
-    def read(text: str) -> Any:
-        try:
-            return kind(text)
-        except ValueError:
-            right = "a whole number" if kind is int else "a number"
-            raise argparse.ArgumentTypeError(f"{text!r} is not {right}, such as {example}") from None
-
-    return read
-
-
-def _shown(value: Any) -> str:
-    return " ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
-
-
-def options(default: Any) -> dict[str, Any]:
-    """How argparse reads a field whose default is `default`."""
-    if isinstance(default, bool):
-        return {"action": argparse.BooleanOptionalAction}
-    if isinstance(default, int):
-        return {"type": _number(int, default), "metavar": "N"}
-    if isinstance(default, float):
-        return {"type": _number(float, default), "metavar": "X"}
-    if isinstance(default, tuple):
-        return {"type": _number(int, default[0]), "metavar": "N", "nargs": "+"}
-    return {"metavar": "NAME"}
-
-
-def parser() -> Parser:
-    """The command line's parser, made of `Config`'s fields."""
-    width = min(120, shutil.get_terminal_size((110, 24)).columns)
-    made = Parser(
-        prog=PROG, usage=f"{PROG} [flags]", description=DESCRIPTION, epilog=EPILOG, add_help=False, allow_abbrev=False,
-        formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, max_help_position=34, width=width),
-    )  # fmt: skip
-    group = made.add_argument_group("grid")
-    texts = {
-        "env": f"worlds: {', '.join(peps_envs.names())}",
-        "method": f"methods: {', '.join(methods.METHODS)}",
-        "lam": "reconciliation parameters: weight of explicability against return",
-    }
-    for name in GRID:
-        kind = {"type": _number(float, 2.4), "metavar": "X"} if name == "lam" else {"metavar": "NAME"}
-        values = DEMONSTRATION[name]
-        group.add_argument(f"--{name}", nargs="+", default=values, help=f"{texts[name]} [{_shown(values)}]", **kind)
-    text = "seeds for each: --seed and those after it [2]"
-    group.add_argument("--seeds", default=2, help=text, **options(2))
-
-    group = made.add_argument_group("results")
-    group.add_argument("--out", default="results/sweep", metavar="DIR", help="folder to write [results/sweep]")
-    group.add_argument("--overwrite", action="store_true", help="replace the results that the folder holds")
-    text = "evaluation episodes, by the policy's mode [100]"
-    group.add_argument("--episodes", default=100, help=text, **options(100))
-    group.add_argument("-h", "--help", action="help", help="show this and exit")
-
-    groups = {name: made.add_argument_group(title) for name, title in TITLES.items()}
-    for field in dataclasses.fields(Config):
-        if field.name in GRID or not field.metadata.get("flag", True):
-            continue
-        name = field.metadata.get("group", "other")
-        if name not in groups:
-            groups[name] = made.add_argument_group(name)
-        text = field.metadata.get("help", "") + ("" if field.default is None else f" [{_shown(field.default)}]")
-        flag = f"--{field.name.replace('_', '-')}"
-        groups[name].add_argument(flag, default=field.default, help=text.replace("%", "%%"), **options(field.default))
-    return made
-
-
-def request(arguments: Sequence[str]) -> Request:
-    """Reads and checks a command line.
-
-    Raises:
-      ValueError: a value makes no sense; one line says which and what would be right.
-      SystemExit: a flag that doesn't exist or can't be read (code 2), or --help (code 0).
-    """
-    settings = vars(parser().parse(arguments))
-    settings = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
-    for name in ("seeds", "episodes"):
-        if not 1 <= settings[name] <= MOST:
-            raise ValueError(f"{name} {settings[name]} is out of range: choose 1 to {MOST}")
-    last = 2**31 - settings["seeds"]  # a cell's seed is a 32-bit number
-    if not 0 <= settings["seed"] <= last:
-        raise ValueError(f"seed {settings['seed']} is out of range: choose 0 to {last}")
-    for name in GRID:
-        settings[name] = tuple(dict.fromkeys(settings[name]))
-    fields = [field.name for field in dataclasses.fields(Config) if field.name in settings and field.name not in GRID]
-    fixed = {name: settings[name] for name in fields}
-
-    cells, trainings = [], {}
-    seeds = range(settings["seed"], settings["seed"] + settings["seeds"])
-    for env, method, lam in itertools.product(*(settings[name] for name in GRID)):
-        config = Config(**(fixed | {"env": env, "method": method, "lam": lam}))
-        check(config)
-        for seed in seeds:
-            own = f"lam{lam}-" if methods.get(method).uses_lam else ""
-            cells.append(Cell(env, method, lam, seed, training=f"{env}-{method}-{own}seed{seed}"))
-            trainings.setdefault(cells[-1].training, config.replace(seed=seed))
-    out = Path(settings["out"])
-    _check_folder(out, settings.pop("overwrite"))
-    return Request(cells, trainings, settings, settings["episodes"], out)
-
-
-def _check_folder(out: Path, overwrite: bool) -> None:
-    if results.holds_results(out) and not overwrite:
-        raise ValueError(
-            f"out {str(out)!r} holds another run's results: choose another folder, or add --overwrite to replace them"
-        )
-    check_writable(out)
-
-
-def check_writable(out: Path) -> None:
-    """Raises ValueError, in one line, if no folder can be made or written at `out`."""
-    existing = next(path for path in (out, *out.absolute().parents) if path.exists())
-    if not existing.is_dir():
-        raise ValueError(f"out {str(out)!r} can't be a folder: {str(existing)!r} is a file; choose another name")
-    if not os.access(existing, os.W_OK):
-        raise ValueError(
-            f"out {str(out)!r} can't be written: {str(existing)!r} doesn't allow it; choose another folder"
-        )
-
-
-# --- what is shown --------------------------------------------------------------------------------------------------------
-
-
-class Display:
-    """Progress on stderr: a bar on a terminal, a line now and then elsewhere."""
-
-    def __init__(self, total: int):
-        from rich.console import Console, Group
-        from rich.live import Live
-        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-        from rich.text import Text
-
-        self._total, self._done, self._figures, self._doing = total, 0, "", ""
-        console = Console(stderr=True)
-        columns = (TextColumn("{task.description}"), BarColumn(None), TaskProgressColumn(), TimeRemainingColumn())
-        self._bar = Progress(*columns, speed_estimate_period=120, expand=True)
-        self._task = self._bar.add_task("", total=total)
-        shown = lambda: Group(self._bar, Text(self._figures))
-        self._live = Live(get_renderable=shown, console=console) if console.is_terminal else None
-        self._before, self._started = 0, 0.0  # steps and clock at the batch's start
-        self._printed = 0.0  # clock at the last line
-        self._latest = {"return_": float("nan"), "explicability": float("nan")}
-
-    def __enter__(self) -> Display:
-        if self._live:
-            self._live.start(refresh=True)
-        return self
-
-    def __exit__(self, *exception: Any) -> None:
-        if self._live:
-            self._live.stop()
-
-    def say(self, text: str) -> None:
-        """What happens now."""
-        self._doing = text
-        self._bar.update(self._task, description=text)
-        if not self._live:
-            print(text, file=sys.stderr, flush=True)
-
-    def begin(self, text: str) -> None:
-        """A batch starts to run."""
-        self.say(text)
-        self._before, self._started = self._done, time.perf_counter()
-        self._printed = self._started
-
-    def progress(self, env_steps: int, curves: dict[str, np.ndarray]) -> None:
-        """`env_steps` more are done, and what their episodes were like on average."""
-        self._done += env_steps
-        for name in self._latest:
-            seen = curves[name][np.isfinite(curves[name])]
-            self._latest[name] = seen.mean() if seen.size else self._latest[name]
-        now = time.perf_counter()
-        speed = (self._done - self._before) / (now - self._started)
-        returns, explicability = self._latest["return_"], self._latest["explicability"]
-        self._figures = f"{speed:,.0f} steps/s, return {returns:.1f}, explicability {explicability:.1f}"
-        self._bar.update(self._task, completed=self._done)
-        if not self._live and (now - self._printed > PATIENCE or self._done == self._total):
-            self._printed = now
-            share, left = 100 * self._done / self._total, (self._total - self._done) / speed
-            print(f"{self._doing}: {share:.0f} %, {left:.0f} s left, {self._figures}", file=sys.stderr, flush=True)
-
-
-def print_table(rows: Sequence[Row]) -> None:
-    """A line for each world, method and lambda: mean and standard deviation over the seeds that didn't fail."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
-    for name in ("env", "method", "lambda"):
-        table.add_column(name)
-    records_of = {row.cell.training: results.record(row) for row in rows}
-    rates = list(dict.fromkeys(name for record in records_of.values() for name in record if name.endswith("_rate")))
-    events = (name.removesuffix("_rate").replace("_", " ") for name in rates)
-    for name in ("return", "explicability", *events, "seeds"):
-        table.add_column(name, justify="right", no_wrap=True)
-    groups: dict[tuple[str, str, str], list[Row]] = {}
-    for row in rows:
-        lam = f"{row.cell.lam:g}" if methods.get(row.cell.method).uses_lam else "any"
-        groups.setdefault((row.cell.env, row.cell.method, lam), []).append(row)
-    for key, members in groups.items():
-        trainings = {row.cell.training: row for row in members}.values()
-        records = [records_of[row.cell.training] for row in trainings if not row.finished.failed]
-        failed = len(trainings) - len(records)
-        seeds = f"{len(records)}" + (f", {failed} failed" if failed else "")
-        figures = (_spread(records, name) for name in ("return_mean", "explicability_mean"))
-        table.add_row(*key, *figures, *(_rate(records, name) for name in rates), seeds)
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
-
-
-def _spread(records: Sequence[dict[str, Any]], name: str) -> str:
-    values = [record[name] for record in records]
-    return f"{np.mean(values):.1f} ± {np.std(values):.1f}" if values else "–"
-
-
-def _rate(records: Sequence[dict[str, Any]], name: str) -> str:
-    values = [record[name] for record in records if name in record]
-    return f"{100 * np.mean(values):.0f} %" if values else "–"
-
-
-# --- what is done ---------------------------------------------------------------------------------------------------------
+class StoppedError(Exception):
+    """The process was asked to end, and has made a checkpoint."""
 
 
 class Sweep:
-    """A request on its way: what is finished, and its folder."""
+    """A request on its way: what is finished, and its folder.
 
-    def __init__(self, wanted: Request, command: str):
-        self._wanted = wanted
-        self._names, self._configs = list(wanted.trainings), list(wanted.trainings.values())
-        self.batches = batch.plan(self._configs, wanted.episodes)
+    Raises:
+      ValueError: it doesn't fit in memory, or the folder doesn't hold what is to be continued.
+      NotWrittenError: from whatever writes, if there is no room or no permission.
+    """
+
+    def __init__(self, wanted: Request, command: str, team: processes.Team):
+        self._wanted, self._team = wanted, team
+        self._configs = list(wanted.trainings.values())
+        self._places = {name: place for place, name in enumerate(wanted.trainings)}
         self._writer = results.Writer(wanted.out, command, wanted.settings)
+        self._ledger = ledger.Ledger(wanted.out, _about(wanted))
         self._finished: dict[str, batch.Finished] = {}
         self._times, self._env_steps = batch.Times(), 0
+        self._tables = checkpoint.Rhythm(1.0)
+        self._plan = self._open() if team.leads else self._opened()
+        self.batches = {number: self._batch(self._plan.batches[number]) for number in self._plan.shares[team.index]}
+
+    # who does what
+
+    def _open(self) -> ledger.Plan:
+        """Plans the sweep, or reads the plan of the one to be continued, and shares out what is left."""
+        if self._wanted.resume:
+            plan = self._ledger.plan()
+            left = [number for number in range(len(plan.batches)) if not self._read(number, plan.batches[number])]
+        else:
+            names = list(self._wanted.trainings)
+            batches = self._divided()
+            left = list(range(len(batches)))
+            plan = ledger.Plan(
+                tuple(ledger.Planned(tuple(names[i] for i in one.cells), one.slots) for one in batches), (), ""
+            )
+            ledger.clear(self._wanted.out)
+        shares = tuple(tuple(left[index :: self._team.count]) for index in range(self._team.count))
+        plan = plan._replace(shares=shares, run=self._team.run)
+        self._ledger.begin(plan)
+        self.save("running")
+        return plan
+
+    def _divided(self) -> list[batch.Batch]:
+        devices = jax.devices()
+        free = None  # measured
+        if self._team.neighbours > 1 and not batch.side_by_side(devices):
+            free = batch.available_bytes(devices) // self._team.neighbours
+        most = batch.cells_soon_done(devices)
+        return batch.plan(self._configs, self._wanted.episodes, devices, free, most, self._team.count)
+
+    def _opened(self) -> ledger.Plan:
+        """Waits for process 0 to share out the batches."""
+        end = time.monotonic() + processes.PATIENCE
+        while time.monotonic() < end:
+            with contextlib.suppress(ValueError):
+                plan = self._ledger.plan()
+                if plan.run == self._team.run:
+                    return plan
+            time.sleep(0.1)
+        raise ValueError(
+            f"out {str(self._wanted.out)!r}: process 0 hasn't shared out the batches in {processes.PATIENCE} s; "
+            "see what it says, and that every process sees this folder"
+        )
+
+    def _batch(self, planned: ledger.Planned) -> batch.Batch:
+        devices = tuple(jax.devices()[: planned.slots])
+        slots = planned.slots
+        if slots % len(devices):  # it was planned for another machine
+            slots = -(-len(planned.trainings) // len(devices)) * len(devices)
+        return batch.Batch(tuple(self._places[name] for name in planned.trainings), slots, devices)
+
+    # what is finished
 
     def rows(self) -> list[Row]:
         """The finished cells, in the grid's order."""
         finished = self._finished
         return [Row(cell, finished[cell.training]) for cell in self._wanted.cells if cell.training in finished]
 
+    @property
+    def complete(self) -> bool:
+        return len(self._finished) == len(self._configs)
+
     def save(self, status: str) -> None:
-        """Writes what is finished."""
-        if self._finished:
-            self._writer.save(self.rows(), self._times, self._env_steps, status)
+        """Writes tables of what is finished."""
+        if self._team.leads:
+            with self._tables.making():
+                self._writer.save(self.rows(), self._times, self._env_steps, status)
 
-    def run(self) -> None:
-        """Runs batch by batch, and saves after each."""
-        self._wanted.out.mkdir(parents=True, exist_ok=True)
-        train_batches(self._configs, self.batches, self._wanted.episodes, self._keep)
-        self.save("complete")
+    def keep(self, number: int, finished: Sequence[batch.Finished], times: batch.Times) -> None:
+        """Writes a batch that this process has finished."""
+        cells = dict(zip(self._plan.batches[number].trainings, finished, strict=True))
+        self._ledger.commit(number, cells, times)
+        self._take(cells, times)
 
-    def _keep(self, places: Sequence[int], finished: Sequence[batch.Finished], times: batch.Times) -> None:
-        self._finished |= {self._names[place]: cell for place, cell in zip(places, finished, strict=True)}
+    def _take(self, cells: Mapping[str, batch.Finished], times: batch.Times) -> None:
+        self._finished |= cells
         self._times += times
-        self._env_steps += sum(_steps(self._configs[place]) for place in places)
-        self.save("running")
+        self._env_steps += sum(env_steps(cell.result.config) for cell in cells.values())
+        if self._tables.due():
+            self.save("running")
+
+    def _read(self, number: int, planned: ledger.Planned) -> bool:
+        """Takes in a batch that is done; whether it is. One that is damaged isn't."""
+        try:
+            done = self._ledger.done(number)
+            if done is None:
+                return False
+            read = lambda name: results.read_cell(
+                self._wanted.out, name, self._wanted.trainings[name], self._wanted.episodes, done.cells[name]
+            )
+            cells = {name: read(name) for name in planned.trainings}
+        except files.DamagedError as error:
+            print(f"a file of batch {number} is damaged ({error}): it is trained again", file=sys.stderr)
+            return False
+        self._take(cells, done.times)
+        return True
+
+    # what runs
+
+    def run(self, stop: threading.Event) -> None:
+        """Runs this process's batches, and takes in the others'.
+
+        Raises:
+          StoppedError: `stop` was set, and a checkpoint is made.
+          IncompatibleError: a checkpoint that doesn't fit.
+        """
+        checkpoint.prepare()
+        with Keeper(self, stop) as keeper:
+            batch.run(self._configs, list(self.batches.values()), self._wanted.episodes, keeper)
+
+    def gather(self, stop: threading.Event) -> dict[int, str]:
+        """Takes in what the other processes finish, until all have ended; what went wrong, by process."""
+        if self._team.count == 1 or not self._team.leads:
+            return {}
+        others = processes.Others(self._wanted.out, self._team)
+        left = {number for share in self._plan.shares[1:] for number in share}
+        patience = None
+        while True:
+            if stop.is_set():
+                raise StoppedError
+            ends = others.ends()
+            left -= {number for number in left if self._read(number, self._plan.batches[number])}
+            if not left or len(ends) == self._team.count - 1:
+                # a shared folder may show the file of a batch later than the sign that its process is done
+                patience = time.monotonic() + processes.LATE if patience is None else patience
+                late = [
+                    number
+                    for index, end in ends.items()
+                    if end == processes.DONE
+                    for number in self._plan.shares[index]
+                ]
+                if not left.intersection(late) or time.monotonic() > patience:
+                    return {index: end for index, end in ends.items() if end != processes.DONE}
+            time.sleep(0.2)
+
+    def checkpoints(self, number: int) -> checkpoint.Checkpoints:
+        return self._ledger.checkpoints(number, [self._configs[place] for place in self.batches[number].cells])
+
+    def close(self) -> None:
+        """Tables are written and pictures drawn: nothing is left to continue."""
+        self.save("complete")
+        self._ledger.close()
 
 
-Keep = Callable[
-    [Sequence[int], Sequence[batch.Finished], batch.Times], None
-]  # places in the list, their cells, seconds
+class Keeper(Display):
+    """Progress on stderr; checkpoints, and every batch kept as soon as it is done."""
+
+    def __init__(self, sweep: Sweep, stop: threading.Event):
+        super().__init__(sweep._configs, list(sweep.batches.values()), name=sweep._team.name)
+        self._sweep, self._stop = sweep, stop
+        self._number_of = {one: number for number, one in sweep.batches.items()}
+        self._rhythm = checkpoint.Rhythm(sweep._wanted.running["checkpoint_every"])
+
+    def start(self, current: batch.Batch) -> batch.Progress | None:
+        if self._stop.is_set():
+            raise StoppedError
+        self._checkpoints = self._sweep.checkpoints(self._number_of[current])
+        first = self._configs[current.cells[0]]
+        progress = self._checkpoints.latest(batch.empty_progress(first, len(current.cells)))
+        self.begin(current, progress.rounds if progress else 0)
+        return progress
+
+    def advanced(
+        self, current: batch.Batch, rounds: int, curves: dict[str, np.ndarray], snapshot: Callable[[], batch.Progress]
+    ) -> None:
+        super().advanced(current, rounds, curves, snapshot)
+        if self._stop.is_set() or self._rhythm.due():
+            with self._rhythm.making():
+                self._checkpoints.save(snapshot())
+        if self._stop.is_set():
+            raise StoppedError
+
+    def finished(self, current: batch.Batch, cells: Sequence[batch.Finished], times: batch.Times) -> None:
+        self._sweep.keep(self._number_of[current], cells, times)
 
 
-def train_batches(configs: Sequence[Config], batches: Sequence[batch.Batch], episodes: int, keep: Keep) -> None:
-    """Trains and evaluates `configs` as `batches` divide them, with progress on stderr; `keep` gets each batch when it is done."""
-    with Display(sum(map(_steps, configs))) as display:
-        for number, current in enumerate(batches, 1):
-            cells = [configs[place] for place in current.cells]
-            name = f"{cells[0].method}, {len(cells)} cells" + f", batch {number}/{len(batches)}" * (len(batches) > 1)
-            display.say(f"compiling {name}")
-            program, compiling = batch.program(cells[0], current, episodes)
-            display.begin(f"training {name}")
-            share = len(cells) * cells[0].steps_per_round
-            report = lambda done, curves, share=share: display.progress(share * _rounds(curves), curves)
-            finished, running = program.run(cells, report)
-            keep(current.cells, finished, compiling + running)
+def _about(wanted: Request) -> dict[str, str]:
+    """What has to be the same for a sweep to be continued."""
+    told = results.machine()
+    versions = {name: told["versions"][name] for name in ("peps-jax", "jax", "jaxlib")}
+    device = jax.devices()[0]
+    numbers = ledger.numbers_digest(list(wanted.trainings.values()))
+    return versions | {
+        "devices": f"{device.platform} {device.device_kind}",
+        "configuration": files.json_digest([results.plain(wanted.settings), numbers]),
+    }
 
 
-def _steps(config: Config) -> int:
-    """Environment steps of a training."""
-    return config.num_rounds * config.steps_per_round
-
-
-def _rounds(curves: dict[str, np.ndarray]) -> int:
-    return next(iter(curves.values())).shape[1]
+@contextlib.contextmanager
+def terminable() -> Iterator[threading.Event]:
+    """SIGTERM sets the event meanwhile, and ends nothing by itself."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -395,23 +261,46 @@ def main(arguments: Sequence[str] | None = None) -> int:
     use_every_core()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        wanted = request(arguments)
-        sweep = Sweep(wanted, shlex.join([*PROG.split(), *arguments]))
-    except ValueError as error:
-        print(f"{PROG}: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    try:
-        sweep.run()
-        rows = sweep.rows()
-        pictures = _draw(rows, wanted.out)
+        wanted = read(arguments)
+        if wanted.resume and _is_complete(wanted.out):
+            print(f"{wanted.out} is complete: {len(wanted.cells)} cells, nothing to continue")
+            return 0
+        by_hand = (wanted.running[name] for name in ("coordinator", "processes", "process"))
+        distributed = wanted.running["distributed"] or wanted.running["coordinator"]
+        team = processes.join(*by_hand) if distributed else processes.alone()
+        sweep = Sweep(wanted, wanted.begun_by or shlex.join([*PROG.split(), *arguments]), team)
+    except (ValueError, files.NotWrittenError) as error:
+        return refuse(PROG, error)
     except KeyboardInterrupt:
-        sweep.save("interrupted")
-        kept = f"{len(sweep.rows())} of {len(wanted.cells)} cells are finished"
-        print(
-            f"\nstopped: {kept}" + (f" and kept in {wanted.out}" if sweep.rows() else "; nothing to keep"),
-            file=sys.stderr,
-        )
+        print("\nstopped before anything was trained", file=sys.stderr)
         return 130
+    life = processes.Life(wanted.out, team)
+    with terminable() as stop:
+        try:
+            sweep.run(stop)
+            if not team.leads:
+                life.end(processes.DONE)
+                print(f"{team.name}: its share is done; process 0 makes the tables", file=sys.stderr)
+                return 0
+            wrong = sweep.gather(stop)
+            if not sweep.complete:
+                return _incomplete(sweep, wanted, wrong)
+            rows = sweep.rows()
+            pictures = _draw(rows, wanted.out)
+            life.end(processes.DONE)
+            sweep.close()
+        except (KeyboardInterrupt, StoppedError) as reason:
+            life.end(processes.STOPPED, "asked to")
+            who = f"{team.name} " if team.name else ""
+            print(f"\n{who}stopped: {_kept(sweep, wanted)}", file=sys.stderr)
+            return 130 if isinstance(reason, KeyboardInterrupt) else 143
+        except (files.NotWrittenError, checkpoint.IncompatibleError) as error:
+            life.end(processes.FAILED, str(error))
+            return refuse(PROG, f"{error}; {_kept(sweep, wanted)}")
+        except Exception as error:
+            life.end(processes.FAILED, f"{type(error).__name__}: {error}".splitlines()[0])
+            print(f"failed: {_kept(sweep, wanted)}", file=sys.stderr)
+            raise
     print_table(rows)
     failed = sum(row.finished.failed for row in rows)
     if failed:
@@ -421,6 +310,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     print(f"go on with: peps_jax.load({str(wanted.out)!r}, {wanted.cells[0].name!r})")
     return 0
+
+
+def _is_complete(out: Path) -> bool:
+    return json.loads((out / results.MANIFEST).read_text()).get("status") == "complete"
+
+
+def _kept(sweep: Sweep, wanted: Request) -> str:
+    """Writes the tables of what is finished, and tells how to go on."""
+    with contextlib.suppress(files.NotWrittenError):  # the cells' own files are there, and make them again
+        sweep.save("interrupted")
+    done = len(sweep.rows())  # of a process that doesn't lead: its own
+    kept = f"{done} of {len(wanted.cells)} cells are finished" + f" and kept in {wanted.out}" * (done > 0)
+    return f"{kept}; continue with: {wanted.continued}"
+
+
+def _incomplete(sweep: Sweep, wanted: Request, wrong: Mapping[int, str]) -> int:
+    for index, reason in wrong.items():
+        print(f"process {index} didn't finish: {reason}", file=sys.stderr)
+    print(f"incomplete: {_kept(sweep, wanted)}", file=sys.stderr)
+    return 1
 
 
 def _draw(rows: Sequence[Row], folder: Path) -> list[str]:

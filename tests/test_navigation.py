@@ -234,7 +234,8 @@ def test_quadrature_has_the_samples_mean_and_variance(params, position, action):
 
 
 def test_quadrature_is_exact_without_walls():
-    params = make_params(sand=EVERYWHERE, sand_stuck=0.25, pit=(3.0, 3.0, 3.1, 3.1), pit_noise=0.3, pit_range=1e3)
+    pit = dict(pit=(3.0, 3.0, 3.1, 3.1), pit_noise=0.3, pit_range=1e3)
+    params = make_params(sand=EVERYWHERE, sand_stuck=0.25, full_action=1.0, **pit)
     weights, places = quadrature(jnp.array([3.0, 3.0]), jnp.array([0.8, 0.0]), params, 5)
     mean = weights @ places
     np.testing.assert_allclose(mean, [3 + 0.75 * 0.6, 3.0], atol=1e-5)
@@ -266,7 +267,7 @@ def test_the_first_two_domains_are_deterministic(name):
 @given(st.floats(2.5, 3.5, width=32), st.floats(0, 1, width=32), st.floats(-1, 1, width=32))
 def test_walls_stop_and_let_slide(along, towards, sideways):
     params = make_params(walls=(BLOCK,))
-    length = 0.75 / max(1, np.hypot(towards, sideways))
+    length = 0.75 / max(0.85, np.hypot(towards, sideways))
     for face, axis, sign in ((1.5, 0, 1), (4.5, 0, -1), (1.5, 1, 1), (4.5, 1, -1)):
         position, action = np.float32([along, along]), np.float32([sideways, sideways])
         position[axis], action[axis] = face, sign * towards
@@ -281,10 +282,16 @@ def test_a_step_stops_at_the_wall_and_at_the_arenas_edge():
     np.testing.assert_allclose(step(0, at([0.2, 3.0]), jnp.array([-1.0, 0.0]), params).state.position, [0.0, 3.0])
 
 
-def test_diagonal_steps_are_no_longer_than_straight_ones():
-    for action in ([1.0, 0.0], [1.0, 1.0], [5.0, -5.0]):
+def test_a_steps_length_is_bounded_and_had_before_the_squares_edge():
+    for action, length in (
+        ([1.0, 0.0], 0.75),
+        ([1.0, 1.0], 0.75),
+        ([5.0, -5.0], 0.75),
+        ([0.0, 0.85], 0.75),
+        ([0.425, 0.0], 0.375),
+    ):
         moved = step(0, at([3.0, 3.0]), jnp.array(action), make_params()).state.position - jnp.array([3.0, 3.0])
-        assert np.linalg.norm(moved) == pytest.approx(0.75, rel=1e-5)
+        assert np.linalg.norm(moved) == pytest.approx(length, rel=1e-5)
 
 
 def test_ground_scales_steps():
@@ -316,7 +323,7 @@ def test_time_runs_out_at_the_horizon():
     ],
 )
 def test_reward_is_step_plus_progress_plus_ends(position, action, progress, extra, event):
-    params = make_params(pit=(0.0, 5.0, 1.0, 6.0))
+    params = make_params(pit=(0.0, 5.0, 1.0, 6.0), full_action=1.0)
     after = step(0, at(position), jnp.array(action), params)
     if progress is None:
         progress = np.hypot(4.5, 3.5) - np.hypot(4.5, 4.25)

@@ -274,7 +274,7 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
     monkeypatch.setattr(driving.experiment, "run", lambda parts, make: {part.method for part in parts})
     monkeypatch.setattr(driving.report, "write", lambda found, folder: [folder / f"figure3 of {len(found)} methods"])
     fill(tmp_path, tiny, seeds=3)
-    assert call(["--seeds", 3, "--out", tmp_path], tiny) == 0
+    assert call(["all", "--seeds", 3, "--out", tmp_path], tiny) == 0
     written = {path.name for path in tmp_path.iterdir()} - {store.HEAD, store.CELLS}
     pictures = ("figure1", "figure2", "frontier", "queries")
     assert written == {"improvement.csv"} | {

@@ -151,7 +151,7 @@ def test_worlds_share_a_program_and_methods_do_not(tiny, monkeypatch):
 def test_what_does_not_fit_is_split_into_batches_of_one_size(line):
     cells = [line.replace(seed=seed) for seed in range(7)]
     need = batch.memory_need(line, EPISODES)
-    two_per_device = int((need.working + 2 * 2 * need.state + 100) / batch.AVAILABLE_SHARE)
+    two_per_device = int((batch.bytes_needed(need, 2, together=False) + 100) / batch.AVAILABLE_SHARE)
     planned = batch.plan(cells, EPISODES, free=two_per_device)
     assert [one.slots for one in planned] == [4, 4]
     assert [place for one in planned for place in one.cells] == list(range(7))
@@ -162,7 +162,7 @@ def test_what_does_not_fit_is_split_into_batches_of_one_size(line):
 def test_side_by_side_every_cell_needs_its_working_memory():
     need = batch.MemoryNeed(state=100, working=1000)
     free = int(10_000 / batch.AVAILABLE_SHARE)
-    assert batch.cells_that_fit(need, free, together=False) == 45
+    assert batch.cells_that_fit(need, free, together=False) == 44
     assert batch.cells_that_fit(need, free, together=True) == 8
     assert batch.cells_that_fit(need, 0, together=False) == 0
 
@@ -173,6 +173,15 @@ def test_predicted_memory_grows_as_what_it_counts(line):
     assert 1.5 * base.working < wider.working < 2.5 * base.working
     transition = 4 * (1 + 1 + 1 + 1 + 1)  # bytes: two observations, action, reward, terminated
     assert longer.state - base.state == (16_000 - 160) * transition
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("method", "width", "size"), [("sac", 32, 64), ("sac", 128, 256), ("peps", 64, 256)])
+def test_predicted_memory_is_what_xla_reports(method, width, size):
+    config = peps_jax.Config(method=method, hidden_sizes=(width, width), batch_size=size, total_steps=32_000)
+    used = batch.Program(config, 2, 100, jax.devices()[:1]).bytes_used
+    predicted = batch.bytes_needed(batch.memory_need(config, 100), 2, together=False)
+    assert 0.97 * used < predicted < 1.2 * used
 
 
 def test_values_in_use_at_once_are_counted():
@@ -352,14 +361,22 @@ def test_a_cell_alone_in_a_split_batch_and_beside_a_failing_one(line, train):
     cells = [line.replace(method="peps", seed=seed) for seed in (3, 4, 5)]
     cells[1] = cells[1].replace(learning_rate=float("nan"))
     need = batch.memory_need(cells[0], EPISODES)
-    one_per_device = int((need.working + 2 * need.state + 100) / batch.AVAILABLE_SHARE)
+    one_per_device = int((batch.bytes_needed(need, 1, together=False) + 100) / batch.AVAILABLE_SHARE)
     batches = batch.plan(cells, EPISODES, free=one_per_device)
     assert [one.cells for one in batches] == [(0, 1), (2,)]
-    reported = []
-    finished, times = batch.run(cells, EPISODES, batches, report=lambda done, curves: reported.append(done))
+    reported, finished = [], []
+
+    class Listener(batch.Watch):
+        def advanced(self, batch, rounds, curves, snapshot):
+            reported.append(rounds)
+
+        def finished(self, batch, cells, times):
+            finished.extend(cells)
+            assert times.run > 0
+
+    batch.run(cells, batches, EPISODES, Listener())
     assert [cell.failed for cell in finished] == [False, True, False]
     assert reported == [1, 2, 3, 4] * 2
-    assert times.run > 0
 
     alone = train(cells[2])
     for name, curve in alone.curves.items():

@@ -2,7 +2,7 @@
 
 A point moves in a walled arena, x to the right and y downwards, towards a goal area and past a pit. One step displaces it by
 
-    m = walk(s, s + gain(s) * step_length * a / max(1, |a|)),    s' = walk(m, m + noise(s) * xi),    xi ~ N(0, I),
+    m = walk(s, s + gain(s) * step_length * a / max(full_action, |a|)),    s' = walk(m, m + noise(s) * xi),    xi ~ N(0, I),
 
 and, on sand, not at all with probability `sand_stuck`: a step, then a slip. Walls stop a movement and let it slide along:
 x moves first, as far as the free interval of its row allows, then y in the new column. Gain and noise depend on the ground
@@ -44,6 +44,7 @@ class NavigationParams:
     ice: Array  # (4,) area
     sand: Array  # (4,) area
     step_length: Array  # arena units a step
+    full_action: Array  # norm of the action from which on a step has its full length
     ice_gain: Array  # share of a step that is made on ice
     sand_gain: Array  # share of a step that is made on sand
     sand_stuck: Array  # probability of not moving at all on sand
@@ -243,9 +244,10 @@ class Navigation(Environment):
         position = state.position
         on_ice, on_sand = distance(position, params.ice) <= _SLACK, distance(position, params.sand) <= _SLACK
         gain = jnp.where(on_sand, params.sand_gain, jnp.where(on_ice, params.ice_gain, 1.0))
-        # a step's length is bounded, not its components: the square's corners are no faster
+        # A step's length is bounded, not its components: the square's corners are no faster. Full length is had below the
+        # square's edge already, which a policy that is squashed into it never reaches.
         action = jnp.clip(action, -1.0, 1.0)
-        direction = action / jnp.maximum(1.0, jnp.sqrt(jnp.maximum(jnp.sum(action**2), 1.0)))
+        direction = action / jnp.sqrt(jnp.maximum(jnp.sum(action**2), params.full_action**2))
         near_pit = params.pit_noise * jnp.exp(-0.5 * (distance(position, params.pit) / params.pit_range) ** 2)
         return NavigationNextState(
             position=position,
@@ -283,8 +285,8 @@ def make_params(**changes) -> NavigationParams:
     """
     fields = dict(
         size=(6.0, 6.0), start=(0.5, 0.5), goal=(5.0, 0.0, 6.0, 1.0), pit=NOWHERE, walls=(NOWHERE,), ice=NOWHERE, sand=NOWHERE,
-        step_length=0.75, ice_gain=1.0, sand_gain=1.0, sand_stuck=0.0, ice_noise=0.0, pit_noise=0.0, pit_range=0.6,
-        perception_width=0.2, goal_reward=100.0, pit_reward=-100.0, step_reward=-1.0, progress_reward=1.0,
+        step_length=0.75, full_action=0.85, ice_gain=1.0, sand_gain=1.0, sand_stuck=0.0, ice_noise=0.0, pit_noise=0.0,
+        pit_range=0.6, perception_width=0.2, goal_reward=100.0, pit_reward=-100.0, step_reward=-1.0, progress_reward=1.0,
     )  # fmt: skip
     unknown = sorted(set(changes) - set(fields))
     if unknown:
@@ -293,12 +295,13 @@ def make_params(**changes) -> NavigationParams:
 
 
 _CROSSING = dict(
-    goal=(5.0, 5.0, 6.0, 6.0), pit=(5.0, 0.0, 6.0, 1.0), walls=((1.5, 1.5, 4.5, 4.5),),
+    goal=(4.8, 4.8, 6.0, 6.0), pit=(5.0, 0.0, 6.0, 1.0), walls=((1.5, 1.5, 4.5, 4.5),),
     ice=(1.5, 0.0, 4.5, 1.5), sand=(0.0, 1.5, 1.5, 4.5),
 )  # fmt: skip
 
-# Where things stand in the paper's Figure 2, and what is true there. Reaching the goal past the pit takes 6 steps in D1 and in
-# D2, the detour that a human expects 7; the ice takes 11 in D3 and D4, the sand 12 in D4.
+# Where things stand in the paper's Figure 2, and what is true there. Reaching the goal past the pit takes 7 steps in D1 and in
+# D2, the detour that a human expects 8; the ice takes 10 in D3 and D4, the sand 13 in D4. Each of these ways is still had in as
+# many steps, or in one more on the ice, by who is 5 % slower: a way without slack is none for a policy that acts a little noisily.
 DOMAINS = {
     "d1": dict(start=(0.5, 0.5), pit=(2.0, 0.0, 4.0, 1.0)),
     "d2": dict(start=(0.5, 0.5), pit=(2.0, 0.3, 4.0, 1.0)),
@@ -307,7 +310,7 @@ DOMAINS = {
 }
 
 # What the human thinks instead: unsteady near the pit, slipping on ice and slow there, moving readily on sand.
-DYNAMICS_BIAS = dict(pit_noise=1.0, pit_range=0.4, ice_noise=0.8, ice_gain=0.7, sand_gain=0.77, sand_stuck=0.0)
+DYNAMICS_BIAS = dict(pit_noise=1.5, pit_range=0.35, ice_noise=0.8, ice_gain=0.7, sand_gain=0.77, sand_stuck=0.0)
 
 # What the human wants instead, in the presets with a biased reward: no hurry, and more fear of the pit.
 REWARD_BIAS = dict(step_reward=-0.5, progress_reward=2.0, pit_reward=-200.0)

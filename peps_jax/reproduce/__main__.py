@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from peps_envs.registry import unknown_name
+from peps_jax.command_line import Parser, options, refuse, use_every_core
 from peps_jax.config import Config
+from peps_jax.files import NotWrittenError
 from peps_jax.reproduce import driving, figures, tables
 from peps_jax.reproduce.store import Store
 from peps_jax.reproduce.study import DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
 from peps_jax.study.experiment import STEPS
-from peps_jax.sweep import Parser, options, use_every_core
 
 PROG = "python -m peps_jax.reproduce"
 MOST = 1000  # seeds
@@ -48,6 +49,7 @@ RESULTS = {
     "queries": Result("explicability over the number of queries", figures.queries_needs, figures.queries),
     "ablations": Result("PEPS and DRLHP without parts of them", tables.ablations_needs, tables.ablations),
 }
+GROUPS = {"paper": ("table1", "figure1", "figure2"), "all": tuple(RESULTS)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,12 +64,13 @@ class Request:
 def parser() -> Parser:
     """The command line's parser."""
     texts = "\n".join(f"  {name:10} {result.text}" for name, result in RESULTS.items())
-    epilog = f"results:\n{texts}\n  {'all':10} all of them\n\nThe last three take the first {FEW_SEEDS} seeds."
+    groups = "\n".join(f"  {name:10} {', '.join(members)}" for name, members in GROUPS.items())
+    epilog = f"results:\n{texts}\n{groups}\n\nfrontier, queries and ablations take the first {FEW_SEEDS} seeds."
     made = Parser(
         prog=PROG, usage=f"{PROG} [RESULT ...] [flags]", description=DESCRIPTION, epilog=epilog, allow_abbrev=False,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    made.add_argument("results", nargs="*", default=["all"], metavar="RESULT", help="what to reproduce [all]")
+    made.add_argument("results", nargs="*", default=["paper"], metavar="RESULT", help="what to reproduce [paper]")
     made.add_argument("--out", default="results/reproduce", metavar="DIR", help="folder [results/reproduce]")
     made.add_argument("--seeds", default=10, help="trainings of each method in each domain [10]", **options(10))
     steps = Config().total_steps
@@ -85,13 +88,13 @@ def request(arguments: Sequence[str], base: Config, num_episodes: int) -> Reques
     """
     values = parser().parse(arguments)
     for name in values.results:
-        if name not in (*RESULTS, "all"):
-            raise ValueError(unknown_name("result", name, (*RESULTS, "all")))
+        if name not in (*RESULTS, *GROUPS):
+            raise ValueError(unknown_name("result", name, (*RESULTS, *GROUPS)))
     if not 2 <= values.seeds <= MOST:
         raise ValueError(f"seeds {values.seeds} is out of range: choose 2 to {MOST} (an interval needs two)")
     base = base if values.steps is None else base.replace(total_steps=values.steps)
     base.check()
-    names = tuple(RESULTS) if "all" in values.results else tuple(dict.fromkeys(values.results))
+    names = tuple(dict.fromkeys(each for name in values.results for each in GROUPS.get(name, (name,))))
     made = Request(
         names, Study(base, values.seeds, num_episodes), Store(Path(values.out), base, num_episodes, values.seeds)
     )
@@ -130,9 +133,8 @@ def main(arguments: Sequence[str] | None = None, base: Config | None = None, num
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         wanted = request(arguments, Config() if base is None else base, num_episodes)
-    except ValueError as error:
-        print(f"{PROG}: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+    except (ValueError, NotWrittenError) as error:
+        return refuse(PROG, error)
     try:
         written = run(wanted)
     except KeyboardInterrupt:
@@ -140,6 +142,8 @@ def main(arguments: Sequence[str] | None = None, base: Config | None = None, num
             f"\nstopped: what is finished is kept in {wanted.store.folder}; the same command continues", file=sys.stderr
         )
         return 130
+    except NotWrittenError as error:
+        return refuse(PROG, f"{error}; what is finished is kept, and the same command continues")
     for path in written:
         if path.suffix == ".md":
             print(path.read_text())

@@ -5,12 +5,13 @@ from __future__ import annotations
 import io
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
 import peps_envs
-from peps_jax import results, study
+from peps_jax import files, results, study
 from peps_jax.config import Config
 from peps_jax.reproduce.store import CELLS, digest, settings_of
 from peps_jax.reproduce.study import Study
@@ -50,7 +51,13 @@ def _path(part: Part, folder: Path) -> Path:
 
 def _digest(part: Part) -> str:
     code = {file.name: file.read_text() for folder in CODE for file in sorted(folder.glob("*.py"))}
-    return digest([settings_of(config) for config in part.configs], part.episodes, code)
+    return digest([_recipe(config) for config in part.configs], part.episodes, code)
+
+
+def _recipe(config: Config) -> dict[str, Any]:
+    """Every setting, as JSON knows it; road and belief by their numbers."""
+    numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves((config.params, config.belief))]
+    return settings_of(config.replace(params=None, belief=None)) | {"numbers": results.plain(numbers)}
 
 
 def _leaves(part: Part, folder: Path) -> list[np.ndarray]:
@@ -77,5 +84,5 @@ def _make(part: Part, folder: Path) -> Seen:
     arrays = {str(place): leaf for place, leaf in enumerate(jax.tree.leaves(seen))}
     np.savez_compressed(buffer, digest=np.array(_digest(part)), **arrays)
     path.parent.mkdir(parents=True, exist_ok=True)
-    results.write_whole(path, buffer.getvalue())
+    files.write_whole(path, buffer.getvalue())
     return seen

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import peps_envs
-from peps_jax import plots, results
+from peps_jax import files, plots, results
 from peps_jax.reproduce.store import Record
 from peps_jax.reproduce.study import BASELINES, DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
 from peps_jax.reproduce.tables import SCORES, TITLES, Line, interval
@@ -35,7 +35,7 @@ def _save(figure: Figure, lines: Sequence[Line], folder: Path, name: str) -> lis
         figure.savefig(buffer, format=kind, dpi=plots.DOTS, metadata=undated)
         contents[f"{name}.{kind}"] = buffer.getvalue()
     for file, content in contents.items():
-        results.write_whole(folder / file, content)
+        files.write_whole(folder / file, content)
     return [folder / file for file in contents]
 
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import peps_envs
-from peps_jax import results, sweep
+from peps_jax import files, results
 from peps_jax.config import Config
 from peps_jax.evaluate import Evaluation
 
@@ -94,7 +94,7 @@ class Store:
         self._code = code_digest()
         self._episodes = num_episodes
         self._head = {"settings": settings_of(config) | {"episodes": num_episodes}, "code": self._code, "seeds": seeds}
-        sweep.check_writable(folder)
+        files.check_writable(folder)
         self._check()
 
     def _check(self) -> None:
@@ -129,7 +129,7 @@ class Store:
                 f"out {str(self.folder)!r} can't be made: {error.strerror}; choose another folder"
             ) from None
         head = self._head | results.machine()
-        results.write_whole(self.folder / HEAD, (json.dumps(head, indent=1, allow_nan=False) + "\n").encode())
+        files.write_whole(self.folder / HEAD, files.json_bytes(head))
 
     def _path(self, name: str) -> Path:
         return self.folder / CELLS / f"{name}.npz"
@@ -146,7 +146,7 @@ class Store:
             arrays |= {f"{part}/{key}": values for key, values in getattr(record, part).items()}
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **arrays)
-        results.write_whole(self._path(name), buffer.getvalue())
+        files.write_whole(self._path(name), buffer.getvalue())
 
     def load(self, name: str, recipe: Mapping[str, Any]) -> Record | None:
         """The record called `name`, or None if there is none.

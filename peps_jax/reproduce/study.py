@@ -19,8 +19,8 @@ import peps_envs
 from peps_jax import batch, planner
 from peps_jax.config import Config
 from peps_jax.evaluate import Evaluation, evaluate
+from peps_jax.progress import Display
 from peps_jax.reproduce.store import ROUTES, Record, Store, episodes, settings_of
-from peps_jax.sweep import train_batches
 from peps_jax.train import Result, check
 
 DOMAINS = ("nav-d1", "nav-d2", "nav-d3", "nav-d4")
@@ -33,7 +33,6 @@ PLANNER = {
     "peps": dict(points=1, resolution=121),
     "human": dict(points=7, resolution=61),
 }
-CELLS_PER_DEVICE = 5  # of a CPU in one batch: what a stopped command loses at most
 
 
 class Training(NamedTuple):
@@ -126,9 +125,8 @@ class Study:
 
     def batches(self, trainings: Sequence[Training]) -> list[batch.Batch]:
         """How `trainings` are divided. Raises OutOfMemoryError, a ValueError, if one doesn't fit."""
-        devices = jax.devices()
-        most = None if batch.side_by_side(devices) else CELLS_PER_DEVICE * len(devices)
-        return batch.plan([training.config for training in trainings], self.num_episodes, most=most)
+        configs = [training.config for training in trainings]
+        return batch.plan(configs, self.num_episodes, most=batch.cells_soon_done(jax.devices()))
 
     def make(self, missing: Sequence[Training | Planned], store: Store) -> None:
         """Plans and trains what is missing; each batch is kept as soon as it is done."""
@@ -143,14 +141,16 @@ class Study:
             keep(planned, _plan(planned, self.num_episodes))
         trainings = [what for what in missing if isinstance(what, Training)]
 
-        def keep_batch(places: Sequence[int], finished: Sequence[batch.Finished], times: batch.Times) -> None:
-            seconds = (times.run + times.evaluate) / len(places)
-            for place, cell in zip(places, finished, strict=True):
+        def keep_batch(done: batch.Batch, finished: Sequence[batch.Finished], times: batch.Times) -> None:
+            seconds = (times.run + times.evaluate) / len(done.cells)
+            for place, cell in zip(done.cells, finished, strict=True):
                 keep(trainings[place], _reduce(cell, self.num_episodes, seconds))
 
         if trainings:
             configs = [training.config for training in trainings]
-            train_batches(configs, self.batches(trainings), self.num_episodes, keep_batch)
+            batches = self.batches(trainings)
+            with Display(configs, batches, keep_batch) as display:
+                batch.run(configs, batches, self.num_episodes, display)
 
 
 def _reduce(cell: batch.Finished, num_episodes: int, seconds: float) -> Record:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from peps_jax import results
+from peps_jax import files, results
 from peps_jax.config import Config
 from peps_jax.reproduce.store import Record
 from peps_jax.reproduce.study import BASELINES, DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
@@ -166,7 +166,7 @@ def _head(paper: bool) -> list[str]:
 
 def _write(folder: Path, contents: Mapping[str, str | bytes]) -> list[Path]:
     for name, content in contents.items():
-        results.write_whole(folder / name, content.encode() if isinstance(content, str) else content)
+        files.write_whole(folder / name, content.encode() if isinstance(content, str) else content)
     return [folder / name for name in contents]
 
 

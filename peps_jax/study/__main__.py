@@ -13,8 +13,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from peps_jax.command_line import Parser, options, refuse, use_every_core
+from peps_jax.files import NotWrittenError, check_writable
 from peps_jax.study import experiment, report
-from peps_jax.sweep import Parser, check_writable, options, use_every_core
 
 PROG = "python -m peps_jax.study"
 MOST = 1000  # seeds
@@ -87,14 +88,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     use_every_core()
     try:
         wanted = request(sys.argv[1:] if arguments is None else arguments)
-    except ValueError as error:
-        print(f"{PROG}: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+    except (ValueError, NotWrittenError) as error:
+        return refuse(PROG, error)
     try:
         written = report.write(experiment.run(wanted.parts), wanted.out)
     except KeyboardInterrupt:
         print("\nstopped: nothing is written", file=sys.stderr)
         return 130
+    except NotWrittenError as error:
+        return refuse(PROG, error)
     print((wanted.out / report.TABLE).read_text())
     print(f"in {wanted.out}: {', '.join(path.name for path in written)}")
     return 0

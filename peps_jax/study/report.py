@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from peps_jax import film, results
+from peps_jax import files, film
 from peps_jax.study.experiment import SETTINGS, Conduct, Findings
 from peps_jax.study.ratings import RATERS
 from peps_jax.study.scenes import BEHAVIOURS, typical
@@ -89,6 +89,6 @@ def write(findings: Findings, folder: Path) -> list[Path]:
     film.strips(shown, note).savefig(folder / PICTURE, dpi=150)
     film.animate(shown, folder / FILM)
     numbers = json.dumps(summary(findings), indent=1, allow_nan=False) + "\n"
-    results.write_whole(folder / NUMBERS, numbers.encode())
-    results.write_whole(folder / TABLE, text(findings).encode())
+    files.write_whole(folder / NUMBERS, numbers.encode())
+    files.write_whole(folder / TABLE, text(findings).encode())
     return [folder / name for name in (TABLE, PICTURE, FILM, NUMBERS)]

@@ -1,6 +1,6 @@
 """The original highway-env (1.12.1), in an environment of its own that has it: how fast it steps, and what it does.
 
-    python highway_env_scene.py rate SCENARIO.json SECONDS        prints policy steps a second, random actions
+    python highway_env_scene.py rate SCENARIO.json SECONDS        prints policy steps and seconds, random actions; see `protocol`
     python highway_env_scene.py record SCENARIOS.json OUT.npz     writes what `peps_envs.highway.replay` should return
 
 A scenario is a recording's `meta`; for `record`, a dictionary of names, each with `meta` and `actions`.
@@ -11,6 +11,7 @@ import sys
 import time
 
 import numpy as np
+import protocol
 from highway_env.envs.highway_env import HighwayEnv
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
@@ -73,10 +74,11 @@ def populate(environment: HighwayEnv, meta: dict) -> list[Vehicle]:
     return vehicles
 
 
-def rate(meta: dict, seconds: float, horizon: int = 8) -> float:
-    """Policy steps a second, with random actions and a new start after a crash or `horizon` steps."""
+def rate(meta: dict, seconds: float, wait: bool, horizon: int = 8) -> None:
+    """Policy steps for about `seconds`, with random actions and a new start after a crash or `horizon` steps."""
     environment, random = make_environment(meta), np.random.default_rng(0)
     populate(environment, meta)
+    preparation = protocol.get_ready(wait)
     steps = age = 0
     start = time.perf_counter()
     while time.perf_counter() - start < seconds:
@@ -85,7 +87,7 @@ def rate(meta: dict, seconds: float, horizon: int = 8) -> float:
         if crashed or age == horizon:
             populate(environment, meta)
             age = 0
-    return steps / (time.perf_counter() - start)
+    protocol.report(steps, time.perf_counter() - start, preparation)
 
 
 def record(meta: dict, actions: list[int]) -> dict[str, np.ndarray]:
@@ -130,11 +132,11 @@ def record(meta: dict, actions: list[int]) -> dict[str, np.ndarray]:
 
 
 def main() -> None:
-    task, source, target = sys.argv[1:]
+    task, source, target = (argument for argument in sys.argv[1:] if argument != "--wait")
     with open(source) as file:
         content = json.load(file)
     if task == "rate":
-        print(rate(content, float(target)))
+        rate(content, float(target), "--wait" in sys.argv)
     else:
         arrays = {
             f"{name}/{key}": values

@@ -1,0 +1,269 @@
+"""What a measurement says: one table, sentences, and one picture."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Any
+
+from rounds import PARTS
+
+Record = dict[str, Any]
+AIMS = {  # of ratios within one run
+    "fastest peer, 64": 3.0,
+    "fastest peer, 256": 1.3,
+    "roof, 256": 0.8,
+    "PEPS of SAC": 0.5,
+    "linear": 0.1,
+}
+COLOURS = ("#c2255c", "#1c6dd0", "#e8890c", "#2f9e78", "#7048b6", "#5c6770")
+QUIET = "#8a8a8a"
+
+
+def fastest_peer(rows: dict[str, Record]) -> tuple[str, float] | None:
+    """Its name and rate, of those that are there."""
+    rates = {name: row["rate"] for name, row in rows.items() if name != "peps_jax" and "rate" in row}
+    return max(rates.items(), key=lambda item: item[1]) if rates else None
+
+
+def spread_of_seeds(seconds: dict[str, float], devices: int) -> float:
+    """How far a seed's cost strays from the mean over numbers of seeds, from one for each device on."""
+    each = [taken / int(number) for number, taken in seconds.items() if int(number) >= devices]
+    mean = sum(each) / len(each)
+    return max(abs(cost / mean - 1) for cost in each)
+
+
+def ratios(record: Record) -> dict[str, float | None]:
+    """What `AIMS` are about; None where there is no peer."""
+    training, devices = record["training"], record["machine"]["devices"]
+    made: dict[str, float | None] = {}
+    for width, rows in training["sac"].items():
+        peer = fastest_peer(rows)
+        made[f"fastest peer, {width}"] = rows["peps_jax"]["rate"] / peer[1] if peer else None
+        made[f"roof, {width}"] = rows["peps_jax"]["rate"] / record["roof"][width]["rate"]
+    made["PEPS of SAC"] = training["peps"]["64"]["rate"] / training["sac"]["64"]["peps_jax"]["rate"]
+    made["linear"] = spread_of_seeds(record["growth"]["seeds"], devices)
+    return made
+
+
+# --- text -----------------------------------------------------------------------------------------------------------------
+
+
+def text(record: Record) -> str:
+    """The table, and what to know about it."""
+    return "\n".join([*_table(record), "", "![What was measured](speed.png)", "", *_sentences(record)]) + "\n"
+
+
+def _table(record: Record) -> list[str]:
+    lines = [
+        "| measured | program | environment steps a second | peps_jax is so many times as fast | of the roof | compilation, s |",
+        "|---|---|---|---|---|---|",
+    ]
+    worlds = record["worlds"]
+    for name, row in worlds["rates"].items():
+        lines.append(_row(f"world {name}", "peps_jax", row))
+        for title, other in worlds["others"].items():
+            if other["world"] == name:
+                lines.append(_row(f"world {name}", title, other, row["rate"]))
+    for width, rows in record["training"]["sac"].items():
+        roof = record["roof"][width]["rate"]
+        for title, row in sorted(rows.items(), key=lambda item: -item[1].get("rate", 0.0)):
+            ours = None if title == "peps_jax" else rows["peps_jax"]["rate"]
+            lines.append(_row(f"SAC, {width} units", title, row, ours, roof))
+    for width, row in record["training"]["peps"].items():
+        lines.append(_row(f"PEPS, {width} units", "peps_jax", row))
+    return lines
+
+
+def _row(measured: str, program: str, row: Record, ours: float | None = None, roof: float | None = None) -> str:
+    if "missing" in row:
+        return f"| {measured} | {program} | not measured: {row['missing'].replace('|', ' ')} | | | |"
+    times = f"{ours / row['rate']:,.3g}" if ours else ""
+    share = f"{row['rate'] / roof:.0%}" if roof else ""
+    compilation = f"{row['compilation']:.1f}" if "compilation" in row else ""
+    return f"| {measured} | {program} | {row['rate']:,.0f} | {times} | {share} | {compilation} |"
+
+
+def _sentences(record: Record) -> list[str]:
+    training, machine = record["training"], record["machine"]
+    return [
+        f"{machine['processor']}, {machine['devices']} devices, {record['minutes']:.0f} minutes in all"
+        + (", **much too short to mean anything**" if record["quick"] else "")
+        + ". Rates are summed over all that ran at the same time, and compilation is apart.",
+        "",
+        *(f"* {line}" for line in (
+            _aims(record), _worlds(record), _equal_work(training), _layouts(training), *_rounds(record["rounds"]), _roof(record),
+            *_growth(record),
+        )),
+    ]  # fmt: skip
+
+
+def _aims(record: Record) -> str:
+    said = {name: "not measured" if value is None else f"{value:.2f}" for name, value in ratios(record).items()}
+    for name, value in ratios(record).items():
+        if name in AIMS and value is not None and (value > AIMS[name] if name == "linear" else value < AIMS[name]):
+            said[name] += " (missed)"
+    return (
+        f"Aims, as ratios in this run: 3 times the fastest peer at 64 units: {said['fastest peer, 64']}; 1.3 times at 256: "
+        f"{said['fastest peer, 256']}; 0.8 of the roof at 256: {said['roof, 256']}; PEPS at 0.5 of SAC's rate: "
+        f"{said['PEPS of SAC']}; a seed's cost the same within 0.1: {said['linear']}."
+    )
+
+
+def _worlds(record: Record) -> str:
+    difference = record["worlds"].get("difference")
+    check = f"; 500 of its steps are the JAX world's within {difference:.0e}" if difference is not None else ""
+    return f"Worlds: random actions, a new start after an episode. NumPy's D1 has nothing of the other domains{check}."
+
+
+def _equal_work(training: Record) -> str:
+    ways = [
+        f"{title} {row['way']}" for title, row in training["sac"]["64"].items() if title != "peps_jax" and "rate" in row
+    ]
+    return (
+        "SAC: D1, 16 environments, an update for every 4 steps, batches of 256, two layers, twin critics, Adam at 1e-3. Ours are "
+        "2 trainings on each core. A peer has all cores, as one process or as a training on each, whichever is faster "
+        f"(at 64: {', '.join(ways)}). Stable-Baselines3 and SBX step D1 in one NumPy array for all 16, Brax and rejax step "
+        "the JAX world; evaluations are left out."
+    )
+
+
+def _layouts(training: Record) -> str:
+    parts = []
+    for width, layouts in training["layouts"].items():
+        ours = training["sac"][width]["peps_jax"]["rate"]
+        parts += [f"{name} {rate / ours:.0%} at {width}" for name, rate in layouts.items()]
+    return f"Tried: cells one after the other on each core (taken); {', '.join(parts)} of its rate."
+
+
+def _rounds(rounds: Record) -> list[str]:
+    lines = []
+    for name, seconds in rounds.items():
+        whole, parts = seconds["whole"], {part: taken for part, taken in seconds.items() if part != "whole"}
+        shares = ", ".join(f"{PARTS[part]} {taken / whole:.0%}" for part, taken in parts.items())
+        method, width = name.split()
+        lines.append(
+            f"A round of {method.upper()} at {width} takes {1000 * whole:.0f} ms: {shares}. Parts were timed as programs of "
+            f"their own; together they are {sum(parts.values()) / whole:.0%} of the whole."
+        )
+    return lines
+
+
+def _roof(record: Record) -> str:
+    parts = []
+    for width, roof in record["roof"].items():
+        rate, rounds = record["training"]["sac"][width]["peps_jax"]["rate"], record["rounds"][f"sac {width}"]
+        updates, outside = rounds["improve"] / rounds["whole"], 1 - rounds["improve"] / rounds["whole"]
+        share = rate / roof["rate"]
+        parts.append(
+            f"at {width} an update is {roof['multiply_adds'] / 1e6:.1f} million multiply-adds, which this machine makes at "
+            f"{roof['multiply_adds_per_second'] / 1e9:.0f} billion a second where it does nothing else; SAC reaches {share:.0%} of "
+            f"that ({outside:.0%} of its time is outside the updates, {max(updates - share, 0):.0%} is in them but not in products)"
+        )
+    return f"Roof: the products of an update's shapes alone, on as many devices at once; {'; '.join(parts)}."
+
+
+def _growth(record: Record) -> list[str]:
+    growth = record["growth"]
+    lines = []
+    seeds = growth["seeds"]
+    each = ", ".join(f"{number}: {1000 * taken / int(number):.0f}" for number, taken in seeds.items())
+    lines.append(f"Milliseconds a seed of a short PEPS training, by the number of seeds: {each}.")
+    for kind in ("environments", "ensemble", "width"):
+        each = ", ".join(f"{size}: {1e6 * taken:.0f}" for size, taken in growth[kind].items())
+        lines.append(f"Microseconds an environment step of PEPS on one core, by {kind}: {each}.")
+    compilation = growth["compilation"]
+    keeps = compilation["again"] < 0.5 * compilation["first"]
+    lines.append(
+        f"A sweep's compilation in a fresh process: {compilation['cold']:.1f} s, and {compilation['warm']:.1f} s with JAX's "
+        "persistent cache"
+        + (
+            "."
+            if keeps
+            else f", which the sweep doesn't turn on by itself ({compilation['again']:.1f} s the second time)."
+        )
+    )
+    return lines
+
+
+# --- picture --------------------------------------------------------------------------------------------------------------
+
+
+def draw(record: Record, path: pathlib.Path) -> None:
+    """Worlds, SAC beside others and the roof, PEPS's round, and cost as work grows."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13.0, 8.0), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(2, 2)
+    _draw_worlds(panels[0, 0], record["worlds"])
+    _draw_sac(panels[0, 1], record)
+    _draw_rounds(panels[1, 0], record["rounds"])
+    _draw_growth(panels[1, 1], record["growth"])
+    for panel in panels.flat:
+        panel.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=110)
+
+
+def _bars(panel: Any, names: list[str], rates: list[float | None], colours: list[str]) -> None:
+    places = range(len(names))[::-1]
+    least = min(filter(None, rates)) / 4
+    panel.barh(places, [rate or least for rate in rates], color=colours)
+    panel.set_yticks(places, names)
+    panel.set_xscale("log")
+    for place, rate in zip(places, rates, strict=True):
+        label = "not measured" if rate is None else f"{rate:,.0f}"
+        panel.annotate(label, (rate or least, place), (4, 0), textcoords="offset points", va="center", fontsize=8)
+    panel.set_xlim(least, max(filter(None, rates)) * 6)
+
+
+def _draw_worlds(panel: Any, worlds: Record) -> None:
+    rows = [(f"{name}, peps_jax", row.get("rate"), COLOURS[0]) for name, row in worlds["rates"].items()]
+    rows += [(f"{row['world']}, {name}", row.get("rate"), QUIET) for name, row in worlds["others"].items()]
+    _bars(panel, *map(list, zip(*rows, strict=True)))
+    panel.set_title("Worlds alone: steps a second on all cores")
+
+
+def _draw_sac(panel: Any, record: Record) -> None:
+    training, rows = record["training"], []
+    for width, libraries in training["sac"].items():
+        for name, row in sorted(libraries.items(), key=lambda item: -item[1].get("rate", 0.0)):
+            rows.append((f"SAC {width}, {name}", row.get("rate"), COLOURS[0] if name == "peps_jax" else QUIET))
+        rows.append((f"SAC {width}, products alone", record["roof"][width]["rate"], COLOURS[1]))
+    rows += [(f"PEPS {width}, peps_jax", row["rate"], COLOURS[4]) for width, row in training["peps"].items()]
+    _bars(panel, *map(list, zip(*rows, strict=True)))
+    panel.set_title("Training: steps a second on all cores")
+
+
+def _draw_rounds(panel: Any, rounds: Record) -> None:
+    shown = list(PARTS)
+    for place, seconds in enumerate(reversed(rounds.values())):
+        left = 0.0
+        for part, colour in zip(shown, COLOURS, strict=True):
+            share = seconds.get(part, 0.0) / seconds["whole"]
+            panel.barh(place, share, left=left, color=colour, label=PARTS[part] if place == len(rounds) - 1 else None)
+            left += share
+    panel.axvline(1.0, color=QUIET, linewidth=1)
+    panel.set_yticks(range(len(rounds)), [f"{name.upper()}" for name in reversed(rounds)])
+    panel.set_xlabel("share of the whole round's time")
+    panel.set_title("Where a round's time goes, each part on its own")
+    panel.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.35, -0.16), frameon=False)
+
+
+def _draw_growth(panel: Any, growth: Record) -> None:
+    kinds = ("seeds", "environments", "ensemble", "width")
+    for kind, colour in zip(kinds, COLOURS, strict=False):
+        sizes = [int(size) for size in growth[kind]]
+        # of all that is trained at once: seeds' own figures are of all seeds, environments' of one of them
+        scale = {"environments": sizes}.get(kind, [1] * len(sizes))
+        costs = [cost * factor for cost, factor in zip(growth[kind].values(), scale, strict=True)]
+        panel.plot([size / sizes[0] for size in sizes], [cost / costs[0] for cost in costs], "o-", color=colour,
+                   label=f"{kind} {sizes[0]} to {sizes[-1]}")  # fmt: skip
+    largest = max(max(map(int, growth[kind])) / min(map(int, growth[kind])) for kind in kinds)
+    panel.plot([1, largest], [1, largest], color=QUIET, linewidth=1, linestyle="--", label="in proportion")
+    panel.set_xscale("log", base=2)
+    panel.set_yscale("log", base=2)
+    panel.set_xlabel("so many times the size")
+    panel.set_ylabel("so many times the time")
+    panel.set_title("What more of it costs PEPS")
+    panel.legend(fontsize=8, frameon=False)

@@ -1,0 +1,88 @@
+"""Whole trainings: SAC beside other libraries' at equal work, other ways of laying SAC over the machine, and PEPS."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import peer
+import timing
+
+from peps_jax import Config, batch, train
+
+WIDTHS = (64, 256)
+
+
+class Library(NamedTuple):
+    """A peer's SAC, and the environment steps of a process that take some seconds at each of `WIDTHS`."""
+
+    title: str
+    name: str
+    script: str
+    steps: tuple[int, int]
+
+
+LIBRARIES = (
+    Library("Stable-Baselines3 2.9", "sb3", "sb3_sac.py", (4_000, 2_000)),
+    Library("SBX 0.28", "sbx", "sbx_sac.py", (16_000, 3_200)),
+    Library("Brax 0.14.2", "brax", "brax_sac.py", (24_000, 4_000)),
+    Library("rejax 0.1.3", "rejax", "rejax_sac.py", (32_000, 4_800)),
+)
+QUICK_STEPS = 480
+
+
+def shortened(config: Config, steps: int) -> Config:
+    """`config` with fewer steps, and as many queries in each round as before."""
+    short = config.replace(total_steps=steps)
+    return short.replace(num_queries=config.queries_per_round * short.num_rounds)
+
+
+def steps_of(config: Config) -> int:
+    """Environment steps of a training."""
+    return config.num_rounds * config.steps_per_round
+
+
+def cost(
+    configs: list[Config], devices: int | None = None, together: bool = False, repeats: int = 3
+) -> dict[str, float]:
+    """Trains all `configs`, of one structure: environment steps a second, summed over cells."""
+    cells = timing.spread(batch.stack(configs), devices)
+    program, compilation = timing.compiled(train, cells, devices=devices, together=together)
+    seconds = timing.seconds(program, cells, repeats=repeats)
+    return {"rate": sum(map(steps_of, configs)) / seconds, "seconds": seconds, "compilation": compilation}
+
+
+def seeds_of(config: Config, number: int) -> list[Config]:
+    return [config.replace(seed=seed) for seed in range(number)]
+
+
+def ours(method: str, width: int, steps: int, cells: int, **layout: Any) -> dict[str, float]:
+    """`cells` trainings of D1, at the package's defaults but for their length and width."""
+    config = Config(env="nav-d1", method=method, hidden_sizes=(width, width))
+    return cost(seeds_of(shortened(config, steps), cells), **layout)
+
+
+def theirs(library: Library, width: int, steps: int, quick: bool) -> dict[str, Any]:
+    """A peer's rate, or why there is none."""
+    print(f"{library.title} at {width}", end=", ", flush=True)
+    try:
+        return peer.best(library.name, library.script, ("--width", width, "--steps", steps), quick)
+    except peer.Missing as error:
+        return {"missing": str(error)}
+
+
+def measure(quick: bool) -> dict[str, Any]:
+    """SAC at each width, and PEPS: ours, then the peers' on the same cores."""
+    record: dict[str, Any] = {"sac": {}, "peps": {}, "layouts": {}}
+    cells = 2 * jax.device_count()
+    for place, width in enumerate(WIDTHS):
+        steps = 800 if quick else (12_000, 3_200)[place]
+        rows = record["sac"][str(width)] = {"peps_jax": ours("sac", width, steps, cells)}
+        record["layouts"][str(width)] = {
+            "side by side on each core": ours("sac", width, steps, cells, together=True, repeats=1)["rate"],
+            "all cores for each training": ours("sac", width, steps, cells, devices=1, repeats=1)["rate"],
+        }
+        for library in LIBRARIES:
+            rows[library.title] = theirs(library, width, QUICK_STEPS if quick else library.steps[place], quick)
+    record["peps"]["64"] = ours("peps", 64, 800 if quick else 12_000, cells)
+    return record

@@ -1,0 +1,73 @@
+"""What the command lines share: every core of a CPU as a device, flags made of settings, complaints of one line."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import os
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+FORCED_DEVICES = "--xla_force_host_platform_device_count"
+
+
+def refuse(prog: str, error: Exception | str) -> int:
+    """Says in one line why a command does nothing, or no more; returns the exit code."""
+    print(f"{prog}: error: {' '.join(str(error).split())}", file=sys.stderr)
+    return 2
+
+
+def use_every_core() -> None:
+    """Asks JAX for one device per usable core of a CPU, unless the caller asked for a number. Before JAX meets its devices."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    if FORCED_DEVICES not in flags:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        os.environ["XLA_FLAGS"] = f"{flags} {FORCED_DEVICES}={cores}".strip()
+
+
+class Parser(argparse.ArgumentParser):
+    """Complains in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {' '.join(message.removeprefix('argument ').split())}\n")
+
+    def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
+        """Like `parse_args`, but says which flag was meant."""
+        values, unknown = self.parse_known_args(arguments)
+        for argument in unknown:
+            name = argument.split("=")[0]
+            nearest = difflib.get_close_matches(name, self._option_string_actions, n=1)
+            hint = f"did you mean {nearest[0]}? " if nearest and name.startswith("-") else ""
+            self.error(f"flag {name!r} is unknown: {hint}--help lists them all")
+        return values
+
+
+def number(kind: type, example: Any) -> Callable[[str], Any]:
+    """Reads an int or a float, and says what would be one."""
+
+    def read(text: str) -> Any:
+        try:
+            return kind(text)
+        except ValueError:
+            right = "a whole number" if kind is int else "a number"
+            raise argparse.ArgumentTypeError(f"{text!r} is not {right}, such as {example}") from None
+
+    return read
+
+
+def shown(value: Any) -> str:
+    return " ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
+
+
+def options(default: Any) -> dict[str, Any]:
+    """How argparse reads a field whose default is `default`."""
+    if isinstance(default, bool):
+        return {"action": argparse.BooleanOptionalAction}
+    if isinstance(default, int):
+        return {"type": number(int, default), "metavar": "N"}
+    if isinstance(default, float):
+        return {"type": number(float, default), "metavar": "X"}
+    if isinstance(default, tuple):
+        return {"type": number(int, default[0]), "metavar": "N", "nargs": "+"}
+    return {"metavar": "NAME"}

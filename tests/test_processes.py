@@ -1,0 +1,181 @@
+"""A sweep over several processes has the files of one process, and one that fails takes nothing with it."""
+
+import csv
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+import peps_envs
+from peps_jax import batch, plots, processes, results, sweep
+
+SIZES = [
+    *("--num-envs", "4", "--rollout-length", "10", "--warmup-steps", "40", "--batch-size", "16"),
+    *("--updates-per-step", "0.1", "--hidden-sizes", "8", "--model-hidden-sizes", "8", "--ensemble-size", "3"),
+    *("--total-steps", "160", "--episodes", "4"),
+]
+LINE = ["--env", "line", "--method", "sac", "--seeds", "8", *SIZES]  # four batches of two cells
+
+
+def call(*arguments: str) -> int:
+    try:
+        return sweep.main([*map(str, arguments)])
+    except SystemExit as exit:
+        return exit.code
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """What a sweep's folder has to say: all its files but the manifest, which holds times."""
+    found = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()}
+    found.pop(results.MANIFEST, None)
+    return {name: path.read_bytes() for name, path in found.items()}
+
+
+@pytest.fixture
+def team(line, monkeypatch):
+    """Threads in place of processes: whoever says which one it is has joined the others already."""
+    task = peps_envs.Task(line.env, line.params, {"noisy": line.belief, "true": line.params})
+    monkeypatch.setitem(peps_envs.registry._TASKS, "line", lambda: task)
+    monkeypatch.setattr(batch, "CELLS_PER_DEVICE", 1)
+    monkeypatch.setattr(plots, "draw", lambda rows, folder: [])
+    monkeypatch.setattr(processes, "SILENCE", 1.0)
+    monkeypatch.setattr(processes, "BEAT", 0.1)
+    monkeypatch.setattr(processes, "join", lambda _, count, index: processes.Team(index, count, "this run", count))
+
+
+def member(index: int, count: int) -> list[str]:
+    return ["--coordinator", "here:1", "--processes", str(count), "--process", str(index)]
+
+
+def run_together(folder: Path, indices: list[int], count: int, *flags: str) -> dict[int, int]:
+    """The exit codes of those processes."""
+    codes = {}
+    act = lambda index: codes.update({index: call(*flags, *member(index, count), "--out", folder)})
+    threads = [threading.Thread(target=act, args=(index,)) for index in indices]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return codes
+
+
+def test_processes_divide_the_cells(team, tmp_path):
+    assert call(*LINE, "--out", tmp_path / "one") == 0
+    assert run_together(tmp_path / "three", [0, 1, 2], 3, *LINE) == {0: 0, 1: 0, 2: 0}
+    assert contents(tmp_path / "three") == contents(tmp_path / "one")
+    manifest = json.loads((tmp_path / "three" / results.MANIFEST).read_text())
+    assert manifest["status"] == "complete"
+    assert manifest["env_steps"] == 8 * 160
+
+
+def test_a_process_that_never_comes_is_said_and_the_others_are_kept(team, tmp_path, capsys):
+    folder = tmp_path / "out"
+    assert run_together(folder, [0, 2], 3, *LINE) == {0: 1, 2: 0}
+    error = capsys.readouterr().err
+    assert "process 1 didn't finish: no sign of life" in error
+    assert f"6 of 8 cells are finished and kept in {folder}; continue with: " in error
+    with open(folder / results.TABLE, newline="") as file:
+        assert len(list(csv.DictReader(file))) == 6
+    assert json.loads((folder / results.MANIFEST).read_text())["status"] == "interrupted"
+    assert run_together(folder, [0, 1], 2, "--resume") == {0: 0, 1: 0}, "by other processes, too"
+    assert call(*LINE, "--out", tmp_path / "one") == 0
+    assert contents(folder) == contents(tmp_path / "one")
+
+
+def test_a_process_that_fails_says_why_to_all(team, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(threading, "excepthook", lambda arguments: None)
+    compiled = batch.program
+
+    def refuse(*arguments):
+        if threading.current_thread() in failing:
+            raise MemoryError("no room for this")
+        return compiled(*arguments)
+
+    monkeypatch.setattr(batch, "program", refuse)
+    folder, codes = tmp_path / "out", {}
+    act = lambda index: codes.update({index: call(*LINE, *member(index, 2), "--out", folder)})
+    threads = [threading.Thread(target=act, args=(index,)) for index in (0, 1)]
+    failing = {threads[1]}
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert codes == {0: 1}
+    assert "process 1 didn't finish: failed: MemoryError: no room for this" in capsys.readouterr().err
+    assert len(list((folder / results.CELLS).iterdir())) == 4
+
+
+def test_without_process_0_the_others_are_kept(team, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(processes, "PATIENCE", 0.5)
+    assert run_together(tmp_path / "out", [1], 2, *LINE) == {1: 2}
+    error = capsys.readouterr().err
+    assert "process 0 hasn't shared out the batches" in error
+    assert error.count("\n") == 1
+
+
+def free_port() -> int:
+    with socket.socket() as door:
+        door.bind(("localhost", 0))
+        return door.getsockname()[1]
+
+
+@pytest.mark.slow
+def test_two_processes_have_the_numbers_of_one(tmp_path):
+    one_device = {"XLA_FLAGS": os.environ["XLA_FLAGS"].replace("device_count=2", "device_count=1")}  # the same program
+    cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "compiled"), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    flags = ["--env", "nav-d1", "--method", "sac", "--seeds", "8", *SIZES]
+
+    def start(*more: str) -> subprocess.Popen:
+        command = [sys.executable, "-m", "peps_jax.sweep", *flags, *more]
+        environment = os.environ | cache | one_device
+        return subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+    coordinator = f"localhost:{free_port()}"
+    together = ("--out", str(tmp_path / "two"), "--coordinator", coordinator, "--processes", "2")
+    pair = [start(*together, "--process", str(index)) for index in (0, 1)]
+    told = [process.communicate(timeout=600) for process in pair]
+    assert [process.returncode for process in pair] == [0, 0], told
+    assert "process 1: its share is done" in told[1][1]
+    one = start("--out", str(tmp_path / "one"))
+    _, error = one.communicate(timeout=600)
+    assert one.returncode == 0, error
+    assert contents(tmp_path / "two") == contents(tmp_path / "one")
+    with open(tmp_path / "two" / results.TABLE, newline="") as file:
+        assert [int(row["seed"]) for row in csv.DictReader(file)] == list(range(8)), "every cell once"
+
+
+def test_processes_that_do_not_come_together(capsys, tmp_path, monkeypatch):
+    class Failed:
+        returncode, stdout, stderr = 1, "", "Traceback\nValueError: coordinator_address should be defined.\n"
+
+    monkeypatch.setattr(processes.subprocess, "run", lambda *arguments, **named: Failed)
+    assert call("--distributed", "--out", tmp_path / "out") == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "didn't come together: ValueError: coordinator_address should be defined." in error
+    assert "--coordinator HOST:PORT" in error
+
+
+def test_life_and_death_are_told_apart(tmp_path, monkeypatch):
+    monkeypatch.setattr(processes, "SILENCE", 0.3)
+    monkeypatch.setattr(processes, "BEAT", 0.05)
+    (tmp_path / "progress").mkdir()
+    teams = [processes.Team(index, 4, "now") for index in range(4)]
+    processes.Life(tmp_path, teams[1]._replace(run="earlier")).end(processes.DONE)
+    done, alive = processes.Life(tmp_path, teams[2]), processes.Life(tmp_path, teams[3])
+    others = processes.Others(tmp_path, teams[0])
+    assert others.ends() == {}
+    done.end(processes.DONE)
+    end = time.monotonic() + 0.6
+    while time.monotonic() < end:
+        ends = others.ends()
+        time.sleep(0.02)
+    assert ends == {1: "no sign of life for 0 s", 2: processes.DONE}
+    alive.end(processes.FAILED, "because")
+    assert others.ends()[3] == "failed: because"
