@@ -67,15 +67,16 @@ def test_the_sanity_check_removes_who_answers_at_random():
     passed = np.asarray(jax.jit(participants.attentive)(jax.random.key(2), people))
     careless = np.asarray(people.rationality) == 0
     assert passed[~careless].all()
-    assert 0.2 < passed[careless].mean() < 0.8, "a coin"
+    assert passed[careless].mean() < 0.3, "a coin, and several times"
 
 
 def test_nobody_is_shown_a_collision_but_in_the_sanity_check(given):
     assert given.answers.shape == (comparisons.TRAINERS * comparisons.ANSWERS,)
     assert not np.any(road_scenes.crashed(given.segments))
     assert set(np.unique(given.answers)) <= {0.0, 1.0}
-    answered = np.asarray(given.answered).reshape(comparisons.TRAINERS, -1)
-    assert np.all(answered == answered[:, :1]), "all of a participant's answers count, or none"
+    silent = np.sum(np.asarray(given.answered) == 0)
+    assert silent % comparisons.ANSWERS == 0, "all of a participant's answers count, or none"
+    assert silent < len(given.answered) / 2
 
 
 def test_both_pieces_of_a_pair_begin_alike(given):
@@ -132,13 +133,13 @@ def test_ratings_follow_the_participants_own_worth(scenes):
     config = road_scenes.road("highway-rain")
     shown = jax.tree.map(lambda *rows: jnp.concatenate([row[:1] for row in rows]), *scenes.values())
     people = participants.recruit(jax.random.key(4), 200)
-    ratings = np.asarray(jax.jit(lambda: ratings.rate(jax.random.key(5), people, shown, config))())
-    assert ratings.shape == (200, 4)
-    assert set(np.unique(ratings)) <= set(range(1, 11))
+    given = np.asarray(jax.jit(lambda: ratings.rate(jax.random.key(5), people, shown, config))())
+    assert given.shape == (200, 4)
+    assert set(np.unique(given)) <= set(range(1, 11))
     crash = list(PLANS).index("idle")
     careful = np.asarray(people.rationality) > 0
-    assert np.all(np.argmin(ratings[careful].mean(0)) == crash)
-    assert ratings[~careful].mean() == pytest.approx(5.5, abs=0.5)
+    assert np.all(np.argmin(given[careful].mean(0)) == crash)
+    assert given[~careful].mean() == pytest.approx(5.5, abs=0.5)
 
 
 def test_analysis_of_variance_by_hand():

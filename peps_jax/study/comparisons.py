@@ -27,7 +27,7 @@ BRAKING = 0.5  # share of those who brake meanwhile; the others hold any action,
 FROM_START = 0.8  # share of pairs that begin with the scene; the others begin anywhere
 SAME_LENGTH = 0.5  # share of pairs whose pieces are equally long; the others' unequal lengths tell r-hat's level
 SHORTEST = 2  # steps of a piece
-SPARE = 2  # pairs that are made for each that is shown, because in some of them somebody crashes
+SPARE = 4  # pairs that are made for each that is shown, because in some of them somebody crashes
 
 
 def plans(key: Array, number: int) -> Array:

@@ -28,7 +28,7 @@ FEW_SEEDS = 3  # at each lambda beside the study's own
 SETTINGS = dict(
     lam=2.0, gamma=0.99, num_envs=16, rollout_length=24, warmup_steps=1_920,
     hold_steps=2, reward_scale=0.25, policy_entropy_weight=0.02, initial_temperature=2.0, temperature=0.01,
-    segment_length=HORIZON, num_queries=TRAINERS * ANSWERS, surrogate_learning_rate=1e-3, surrogate_decay=0.1, surrogate_updates=60,
+    segment_length=HORIZON, num_queries=TRAINERS * ANSWERS, surrogate_learning_rate=2e-3,
 )  # fmt: skip
 LAMS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)  # over which PEPS is shown
 
