@@ -235,7 +235,8 @@ def test_a_sweep_writes_the_whole_grid(swept):
     assert {row["status"] for row in rows} == {"ok"}
     for column in ("return_mean", "explicability_mean", "belief_gap_mean", "length_mean", "goal_rate", "pit_rate"):
         assert all(np.isfinite(float(row[column])) for row in rows), column
-    assert rows[0]["explicability_mean"] != rows[2]["explicability_mean"], "lambda changes what PEPS learns"
+    policies = [jax.tree.leaves(peps_jax.load(swept, cell).agents) for cell in (0, 2)]
+    assert not all(map(np.array_equal, *policies)), "lambda changes what PEPS learns"
     sac = [{**row, "lam": "", "cell": ""} for row in rows if row["method"] == "sac"]
     assert sac[:2] == sac[2:], "and nothing of what SAC does"
 
