@@ -14,7 +14,7 @@ from peps_jax import Config, batch, methods, rollout
 from peps_jax.methods import feedback, peps
 from peps_jax.parts import dynamics, human, replay, sac
 from peps_jax.parts.trajectory import Preferences, Trajectory, Transition
-from peps_jax.train import TrainingState, collect_and_ask, improve, init, run_round, run_rounds
+from peps_jax.train import VALUED_TOGETHER, TrainingState, collect_and_ask, improve, init, run_round, run_rounds
 
 PARTS = {  # as the text calls them
     "collect": "collecting",
@@ -58,7 +58,9 @@ def parts(structure: Config) -> dict[str, Callable[..., Any]]:
         return feedback.learn(state.knowledge.surrogate, state.replay, filled, preferences, index, (key, key), config)
 
     def value(state, trajectory, preferences, batches, config):
-        return peps.reward(state.knowledge, batches, config)
+        return jax.lax.map(
+            lambda batch: peps.reward(state.knowledge, batch, config), batches, batch_size=VALUED_TOGETHER
+        )
 
     def update(state, trajectory, preferences, batches, config):
         return improve(state, index, key, plain(config))

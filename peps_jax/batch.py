@@ -9,34 +9,22 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import psutil
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
+from peps_jax import memory, methods, programs
 from peps_jax.config import Config
 from peps_jax.evaluate import Evaluation, evaluate
 from peps_jax.train import Result, TrainingState, finish, init, run_round, run_rounds
 
-# of the free memory that a batch may plan with: the prediction doesn't know what other programs take
-AVAILABLE_SHARE = 0.8
 REPORTS = 40  # chunks of rounds that a training is about cut into: progress, and a place to stop, between two of them
-# operations that write their result over an argument of its size which nobody needs any more; small functions such as an
-# activation are calls
-IN_PLACE = {
-    "jit", "pjit", "custom_jvp_call", "add", "sub", "mul", "div", "rem", "neg", "abs", "sign", "max", "min",
-    "clamp", "and", "or", "not", "xor", "eq", "ne", "lt", "le", "gt", "ge", "select_n", "exp", "log", "log1p",
-    "expm1", "tanh", "logistic", "sin", "cos", "sqrt", "rsqrt", "pow", "integer_pow", "square", "floor", "ceil",
-    "round", "erf", "erf_inv", "is_finite", "copy", "convert_element_type", "reshape", "squeeze", "expand_dims",
-    "dynamic_update_slice",
-}  # fmt: skip
 CELLS_PER_DEVICE = 5  # of a CPU in one batch at most, where it matters that a batch is soon done and kept
 
 
@@ -99,17 +87,6 @@ class Watch:
         """A batch is trained and evaluated."""
 
 
-class MemoryNeed(NamedTuple):
-    """Predicted bytes of one cell."""
-
-    state: int  # what a training carries from round to round
-    working: int  # what a round, or the evaluation, has in use beside it at most
-
-
-class OutOfMemoryError(ValueError):
-    """Not even one cell fits."""
-
-
 def shared(config: Config) -> Config:
     """`config` with its task's code and numbers in place of names, so that worlds which share code share a program."""
     environment, params, belief = config.task()
@@ -122,6 +99,16 @@ def structure(config: Config) -> Any:
     return tree, tuple(jnp.shape(leaf) for leaf in leaves)
 
 
+def _written(config: Config, *more: Any) -> str | None:
+    """`structure` as text, for another process to recognise; None if code decides it that isn't this project's."""
+    cell = shared(config)
+    ours = [type(cell.env), *(part for part in methods.get(cell.method) if callable(part))]
+    if any(part.__module__.split(".")[0] not in ("peps_jax", "peps_envs") for part in ours):
+        return None
+    leaves, tree = jax.tree.flatten(cell)
+    return repr([tree, [(jnp.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves], *more])
+
+
 def stack(cells: Sequence[Config]) -> Config:
     """One `Config` whose every leaf has a leading axis of cells."""
     return jax.tree.map(
@@ -132,7 +119,7 @@ def stack(cells: Sequence[Config]) -> Config:
 # --- memory ---------------------------------------------------------------------------------------------------------------
 
 
-def memory_need(config: Config, num_episodes: int) -> MemoryNeed:
+def memory_need(config: Config, num_episodes: int) -> memory.Need:
     """Predicts a cell's bytes from shapes alone, without compiling.
 
     `state` is exact: agent, knowledge, replay and actors, by `jax.eval_shape` of `init`. `working` walks the traced
@@ -140,81 +127,24 @@ def memory_need(config: Config, num_episodes: int) -> MemoryNeed:
     every operation wrote its result to memory, elementwise ones in place where they can. Measured against programs
     compiled for a CPU, `bytes_needed` of it is 1 to 14 % more than XLA reports (sac and peps, widths 32 to 256, minibatches
     of 64 and 256), and up to 23 % more where a chunk is a single round. Most of it are the minibatches of a round,
-    updates_per_round * batch_size transitions, and the ensembles' hidden activations when all of them get their reward
-    at once.
+    updates_per_round * batch_size transitions.
     """
+    about = _written(config, "memory", num_episodes)
+    return programs.kept(about, lambda: {"need": _memory_need(config, num_episodes)})["need"]
+
+
+def _memory_need(config: Config, num_episodes: int) -> memory.Need:
     cell = shared(config)
     try:
         state = jax.eval_shape(init, cell)
         one_round = jax.make_jaxpr(run_round)(state, jnp.zeros((), jnp.int32), cell)
         scoring = jax.make_jaxpr(lambda state, cell: _evaluate(state, cell, num_episodes))(state, cell)
     except OverflowError:  # sizes that an index can't count
-        return MemoryNeed(state=2**63, working=0)
-    return MemoryNeed(
-        state=sum(_size(leaf) for leaf in jax.tree.leaves(state)),
-        working=max(_most_in_use(one_round.jaxpr), _most_in_use(scoring.jaxpr)),
+        return memory.Need(state=2**63, working=0)
+    return memory.Need(
+        state=sum(memory.size_of(leaf) for leaf in jax.tree.leaves(state)),
+        working=max(memory.most_in_use(one_round.jaxpr), memory.most_in_use(scoring.jaxpr)),
     )
-
-
-def _size(value: Any) -> int:
-    """Bytes of an array, or of the shape of one."""
-    return int(np.prod(value.shape, dtype=object)) * value.dtype.itemsize
-
-
-def _most_in_use(program: Any) -> int:
-    """Bytes of the values that `program` (a jaxpr) has in use at the same time at most, its inputs not counted."""
-    last = {value: place for place, step in enumerate(program.eqns) for value in step.invars if _is_variable(value)}
-    last |= {value: len(program.eqns) for value in program.outvars if _is_variable(value)}
-    made: set[Any] = set()
-    in_use = most = 0
-    for place, step in enumerate(program.eqns):
-        inside = max((_most_in_use(part) for part in _parts(step)), default=0)
-        over = {
-            value for value in (*step.invars, *step.outvars) if _is_variable(value) and last.get(value, -1) <= place
-        }
-        new = sum(_size(value.aval) for value in step.outvars)
-        if step.primitive.name in IN_PLACE:
-            same = next((value for value in over & made if _size(value.aval) == new), None)
-            if same is not None:
-                in_use -= new
-                made.remove(same)
-        in_use += new
-        most = max(most, in_use + inside)
-        made.update(step.outvars)
-        in_use -= sum(_size(value.aval) for value in over & made)
-        made -= over
-    return most
-
-
-def _is_variable(value: Any) -> bool:
-    return not hasattr(value, "val")  # a literal has a value
-
-
-def _parts(step: Any) -> Iterator[Any]:
-    """The programs inside one operation: a scan's body, a branch, a jitted function."""
-    for parameter in step.params.values():
-        for part in parameter if isinstance(parameter, tuple | list) else (parameter,):
-            part = getattr(part, "jaxpr", part)
-            if hasattr(part, "eqns"):
-                yield part
-
-
-def available_bytes(devices: Sequence[jax.Device]) -> int:
-    """Free memory for each of `devices`: the accelerator's own, or a CPU device's share of the machine's."""
-    statistics = [device.memory_stats() or {} for device in devices]
-    if all("bytes_limit" in figures for figures in statistics):
-        return min(figures["bytes_limit"] - figures.get("bytes_in_use", 0) for figures in statistics)
-    return min(psutil.virtual_memory().available, _container_bytes()) // len(devices)
-
-
-def _container_bytes() -> float:
-    """What a container's limit leaves; infinite without one. The system's own figure doesn't know of it."""
-    folder = Path("/sys/fs/cgroup")
-    try:
-        limit, used = ((folder / name).read_text().strip() for name in ("memory.max", "memory.current"))
-        return float("inf") if limit == "max" else int(limit) - int(used)
-    except (OSError, ValueError):
-        return float("inf")
 
 
 def side_by_side(devices: Sequence[jax.Device]) -> bool:
@@ -225,24 +155,6 @@ def side_by_side(devices: Sequence[jax.Device]) -> bool:
 def cells_soon_done(devices: Sequence[jax.Device]) -> int | None:
     """`most` of `plan` for batches that are soon done and kept; None of devices that are quicker with many cells."""
     return None if side_by_side(devices) else CELLS_PER_DEVICE * len(devices)
-
-
-def cells_that_fit(need: MemoryNeed, free: int, together: bool) -> int:
-    """How many cells fit on a device: the largest k whose `bytes_needed` are at most AVAILABLE_SHARE * free."""
-    free = int(AVAILABLE_SHARE * free)
-    each = bytes_needed(need, 2, together) - bytes_needed(need, 1, together)
-    return max(0, free - bytes_needed(need, 0, together)) // each
-
-
-def bytes_needed(need: MemoryNeed, cells: int, together: bool) -> int:
-    """Bytes of a device that has `cells` cells.
-
-    The state counts twice, because new states are written beside the old ones. Cells that are worked on `together` all need
-    their working memory; one after the other they need it once, and a copy of the state that is worked on.
-    """
-    if together:
-        return cells * (2 * need.state + need.working)
-    return (2 * cells + 1) * need.state + need.working
 
 
 def plan(
@@ -271,14 +183,16 @@ def plan(
     batches = []
     for places in groups.values():
         used = devices[: -(-len(places) // shares)]
-        room = available_bytes(used) if free is None else free
+        room = memory.available_bytes(used) if free is None else free
         need = memory_need(cells[places[0]], num_episodes)
-        fit = cells_that_fit(need, room, side_by_side(used)) * len(used)
+        fit = memory.cells_that_fit(need, room, side_by_side(used)) * len(used)
         if fit < 1:
-            raise OutOfMemoryError(
-                f"a {cells[places[0]].method} cell needs about {_readable(need.working + 3 * need.state)} of memory and each of "
-                f"{len(used)} devices has {_readable(AVAILABLE_SHARE * room)} for it: lower total_steps, batch_size, "
-                "updates_per_step, num_envs or the hidden sizes"
+            wanted, given = (
+                memory.readable(size) for size in (need.working + 3 * need.state, memory.AVAILABLE_SHARE * room)
+            )
+            raise memory.OutOfMemoryError(
+                f"a {cells[places[0]].method} cell needs about {wanted} of memory and each of {len(used)} devices has {given} "
+                "for it: lower total_steps, batch_size, updates_per_step, num_envs or the hidden sizes"
             )
         number = -(-len(places) // (fit if most is None else min(fit, most)))
         number = -(-number // shares) * shares  # every process as many
@@ -286,14 +200,6 @@ def plan(
         slots = per_device * len(used)
         batches += [Batch(tuple(places[i : i + slots]), slots, used) for i in range(0, len(places), slots)]
     return batches
-
-
-def _readable(number: float) -> str:
-    for unit in ("B", "kB", "MB", "GB"):
-        if number < 1000:
-            return f"{number:.3g} {unit}"
-        number /= 1000
-    return f"{number:,.0f} TB"
 
 
 # --- programs -------------------------------------------------------------------------------------------------------------
@@ -325,20 +231,28 @@ class Program:
         self._slots = slots
         self._chunks = chunk_lengths(cell.num_rounds)
         start = time.perf_counter()
-        cells = self._shapes(stack([cell] * slots))
-        self._state = state = self._shapes(jax.eval_shape(jax.vmap(init), cells))
+        about = _written(cell, slots, num_episodes)
+        made = programs.kept(about, lambda: self._compile(cell, num_episodes), self._devices)
+        self._init, self._evaluate = made["init"], made["evaluate"]
+        self._advance = {length: made[f"{length} rounds"] for length in set(self._chunks)}
+        self.compile_seconds = time.perf_counter() - start
+
+    def _compile(self, cell: Config, num_episodes: int) -> dict[str, Any]:
+        """The programs by name."""
+        cells = self._shapes(stack([cell] * self._slots))
+        state = self._shapes(jax.eval_shape(jax.vmap(init), cells))
         score = lambda state, cell: _evaluate(state, cell, num_episodes)
         lengths = sorted(set(self._chunks))
         advance = self._over_devices(run_rounds, whole=(1,), donate=(0,))
-        lowered = [
-            self._over_devices(init).lower(cells),
-            self._over_devices(score).lower(state, cells),
-            *(advance.lower(state, jax.ShapeDtypeStruct((length,), jnp.int32), cells) for length in lengths),
-        ]
+        indices = lambda length: jax.ShapeDtypeStruct((length,), jnp.int32)
+        lowered = {
+            "init": self._over_devices(init).lower(cells),
+            "evaluate": self._over_devices(score).lower(state, cells),
+            **{f"{length} rounds": advance.lower(state, indices(length), cells) for length in lengths},
+        }
         with ThreadPoolExecutor() as pool:  # the compiler works outside Python's lock
-            self._init, self._evaluate, *rounds = pool.map(lambda program: program.compile(), lowered)
-        self._advance = dict(zip(lengths, rounds, strict=True))
-        self.compile_seconds = time.perf_counter() - start
+            compiled = pool.map(lambda program: program.compile(), lowered.values())
+            return dict(zip(lowered, compiled, strict=True))
 
     @property
     def bytes_used(self) -> int:
@@ -394,7 +308,7 @@ class Program:
         if start is None:
             state, done, chunks, earlier = self._init(leaves), 0, [], 0.0
         else:
-            state, done, chunks, earlier = self._resumed(start), start.rounds, [start.curves], start.seconds
+            state, done, chunks, earlier = self._resumed(start, cells[0]), start.rounds, [start.curves], start.seconds
         for length in self._chunks[self.chunks_in(done) :]:
             state, curves = self._advance[length](state, jnp.arange(done, done + length, dtype=jnp.int32), leaves)
             chunks.append({name: values[:number] for name, values in jax.device_get(curves).items()})
@@ -427,11 +341,12 @@ class Program:
         """As many as there are slots, since every device gets as many: the last one again and again; dropped in the end."""
         return [*values, *[values[-1]] * (self._slots - len(values))]
 
-    def _resumed(self, start: Progress) -> TrainingState:
+    def _resumed(self, start: Progress, cell: Config) -> TrainingState:
         """`start`'s state on the devices."""
         places = np.asarray(self._padded(range(len(jax.tree.leaves(start.state)[0]))))
+        shapes = jax.eval_shape(init, shared(cell))
         keys = lambda leaf, shape: jax.random.wrap_key_data(leaf) if _is_key(shape) else leaf
-        state = jax.tree.map(keys, jax.tree.map(lambda leaf: leaf[places], start.state), self._state)
+        state = jax.tree.map(keys, jax.tree.map(lambda leaf: leaf[places], start.state), shapes)
         return jax.device_put(state, self._sharding)
 
 

@@ -132,10 +132,11 @@ class Ledger:
             return None
         return Done(stored["cells"], Times(**stored["times"]))
 
-    def close(self) -> None:
-        """Removes it: the sweep is complete."""
-        files.remove(self.folder)
-        files.remove_unfinished(self._results)
+
+def close(folder: Path) -> None:
+    """Removes the progress of a sweep that is complete, and what processes that were killed have left. Raises NotWrittenError."""
+    files.remove(folder / FOLDER)
+    files.remove_unfinished(folder)
 
 
 def clear(folder: Path) -> None:

@@ -24,7 +24,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from peps_jax import batch, checkpoint, files, ledger, processes, results
+from peps_jax import batch, checkpoint, files, ledger, memory, processes, results
 from peps_jax.command_line import refuse, use_every_core
 from peps_jax.progress import Display, env_steps, print_table
 from peps_jax.request import PROG, Request, read
@@ -80,7 +80,7 @@ class Sweep:
         devices = jax.devices()
         free = None  # measured
         if self._team.neighbours > 1 and not batch.side_by_side(devices):
-            free = batch.available_bytes(devices) // self._team.neighbours
+            free = memory.available_bytes(devices) // self._team.neighbours
         most = batch.cells_soon_done(devices)
         return batch.plan(self._configs, self._wanted.episodes, devices, free, most, self._team.count)
 
@@ -195,7 +195,7 @@ class Sweep:
     def close(self) -> None:
         """Tables are written and pictures drawn: nothing is left to continue."""
         self.save("complete")
-        self._ledger.close()
+        ledger.close(self._wanted.out)
 
 
 class Keeper(Display):
@@ -263,6 +263,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         wanted = read(arguments)
         if wanted.resume and _is_complete(wanted.out):
+            ledger.close(wanted.out)  # a kill may have come between the last table and this
             print(f"{wanted.out} is complete: {len(wanted.cells)} cells, nothing to continue")
             return 0
         by_hand = (wanted.running[name] for name in ("coordinator", "processes", "process"))

@@ -10,6 +10,7 @@ os.environ["XLA_FLAGS"] = (
     f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2 --xla_backend_optimization_level=0"
 )
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ["PEPS_JAX_CACHE"] = ""  # tests change code, of which what is kept knows nothing
 
 import dataclasses
 import functools

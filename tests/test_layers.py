@@ -20,7 +20,12 @@ LAYERS = (
     {"peps_envs.registry"},
     {"peps_envs"},
     {"peps_envs.brax_bridge"},
-    {"peps_jax.files", "peps_jax.command_line"},  # they know nothing of trainings
+    {
+        "peps_jax.files",
+        "peps_jax.command_line",
+        "peps_jax.memory",
+        "peps_jax.programs",
+    },  # they know nothing of trainings
     {"peps_jax.config"},
     {"peps_jax.parts", "peps_jax.parts.trajectory", "peps_jax.parts.networks", "peps_jax.parts.replay"},
     {f"peps_jax.parts.{name}" for name in ("dynamics", "human", "queries", "sac", "surrogate")},

@@ -153,6 +153,21 @@ def test_a_terminated_sweep_says_how_to_continue_and_does(whole, tmp_path, capsy
     assert "nothing to continue" in capsys.readouterr().out
 
 
+def test_killed_at_the_very_end(whole, tmp_path, monkeypatch, capsys):
+    def die(folder):
+        raise KilledError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ledger, "close", die)
+        with pytest.raises(KilledError):
+            call(*LINE, "--out", tmp_path)
+    assert status(tmp_path) == "complete"
+    assert (tmp_path / "progress").exists()
+    assert call("--resume", "--out", tmp_path) == 0
+    assert "nothing to continue" in capsys.readouterr().out
+    assert contents(tmp_path) == whole
+
+
 @pytest.mark.slow
 def test_killed_anywhere_and_continued(whole, tmp_path, monkeypatch):
     """The same command again and again, as a script would give it, until the sweep is complete; and so on."""

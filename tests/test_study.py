@@ -157,9 +157,9 @@ def test_groups_of_raters(scenes):
     found = ratings.groups(jax.random.key(0), named, road_scenes.road("highway-rain"), number=3)
     assert len(found) == 3
     assert all(min(group.mean, key=group.mean.get) == "drlhp" for group in found)
-    findings = experiment.Findings(named, {}, {}, found)
+    findings = experiment.Findings(named, {}, {}, found, [])
     assert json.loads(json.dumps(report.summary(findings)))["groups"] == 3
-    assert report.shares(findings)["highest"] == np.mean(
+    assert report.shares(found)["highest"] == np.mean(
         [max(group.mean, key=group.mean.get) == "peps" for group in found]
     )
     renamed = ratings.groups(
@@ -254,11 +254,11 @@ def test_a_small_study_from_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(experiment, "compare", lambda key: jax.tree.map(lambda rows: rows[:20], compare(key)))
     monkeypatch.setattr(experiment, "EPISODES", 8)
     monkeypatch.setattr(experiment, "METHODS", ("peps", "sac"))
-    assert command.main(["--seeds", "1", "--steps", "80", "--lams", "0", "--out", str(tmp_path)]) == 0
+    assert command.main(["--seeds", "1", "--steps", "80", "--lams", "2", "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} == set(command.FILES)
     numbers = json.loads((tmp_path / report.NUMBERS).read_text())
     assert set(numbers["ratings"]["mean"]) == {"peps", "sac"}
-    assert [line["lam"] for line in numbers["over_lam"]] == [0.0, experiment.SETTINGS["lam"]]
+    assert [line["lam"] for line in numbers["over_lam"]] == [experiment.SETTINGS["lam"]]
     assert (tmp_path / report.TABLE).read_text() in capsys.readouterr().out
 
 

@@ -14,7 +14,7 @@ import pytest
 
 import peps_envs
 import peps_jax
-from peps_jax import batch, plots, results, sweep
+from peps_jax import batch, memory, plots, results, sweep
 from peps_jax.train import finish, init
 
 PREFIX = "python -m peps_jax.sweep: error: "
@@ -105,7 +105,7 @@ def test_a_file_is_no_folder(tmp_path, capsys):
 
 def test_too_little_memory_is_said_before_compiling(tmp_path, capsys, monkeypatch, tiny):
     monkeypatch.setattr(batch, "Program", refuse_to_compile)
-    monkeypatch.setattr(batch, "available_bytes", lambda devices: 10_000)
+    monkeypatch.setattr(memory, "available_bytes", lambda devices: 10_000)
     assert call([*tiny_flags(tiny), "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
@@ -142,7 +142,7 @@ def test_importing_the_library_meets_no_device():
 
 
 def test_worlds_share_a_program_and_methods_do_not(tiny, monkeypatch):
-    monkeypatch.setattr(batch, "memory_need", lambda config, num_episodes: batch.MemoryNeed(1000, 1000))
+    monkeypatch.setattr(batch, "memory_need", lambda config, num_episodes: memory.Need(1000, 1000))
     cells = [tiny.replace(env=env, method=method) for env in ("nav-d1", "nav-d3") for method in ("peps", "sac")]
     planned = batch.plan(cells, EPISODES, free=10**9)
     assert [one.cells for one in planned] == [(0, 2), (1, 3)]
@@ -151,20 +151,20 @@ def test_worlds_share_a_program_and_methods_do_not(tiny, monkeypatch):
 def test_what_does_not_fit_is_split_into_batches_of_one_size(line):
     cells = [line.replace(seed=seed) for seed in range(7)]
     need = batch.memory_need(line, EPISODES)
-    two_per_device = int((batch.bytes_needed(need, 2, together=False) + 100) / batch.AVAILABLE_SHARE)
+    two_per_device = int((memory.bytes_needed(need, 2, together=False) + 100) / memory.AVAILABLE_SHARE)
     planned = batch.plan(cells, EPISODES, free=two_per_device)
     assert [one.slots for one in planned] == [4, 4]
     assert [place for one in planned for place in one.cells] == list(range(7))
-    with pytest.raises(batch.OutOfMemoryError, match="each of 2 devices"):
+    with pytest.raises(memory.OutOfMemoryError, match="each of 2 devices"):
         batch.plan(cells, EPISODES, free=need.working)
 
 
 def test_side_by_side_every_cell_needs_its_working_memory():
-    need = batch.MemoryNeed(state=100, working=1000)
-    free = int(10_000 / batch.AVAILABLE_SHARE)
-    assert batch.cells_that_fit(need, free, together=False) == 44
-    assert batch.cells_that_fit(need, free, together=True) == 8
-    assert batch.cells_that_fit(need, 0, together=False) == 0
+    need = memory.Need(state=100, working=1000)
+    free = int(10_000 / memory.AVAILABLE_SHARE)
+    assert memory.cells_that_fit(need, free, together=False) == 44
+    assert memory.cells_that_fit(need, free, together=True) == 8
+    assert memory.cells_that_fit(need, 0, together=False) == 0
 
 
 def test_predicted_memory_grows_as_what_it_counts(line):
@@ -180,7 +180,7 @@ def test_predicted_memory_grows_as_what_it_counts(line):
 def test_predicted_memory_is_what_xla_reports(method, width, size):
     config = peps_jax.Config(method=method, hidden_sizes=(width, width), batch_size=size, total_steps=32_000)
     used = batch.Program(config, 2, 100, jax.devices()[:1]).bytes_used
-    predicted = batch.bytes_needed(batch.memory_need(config, 100), 2, together=False)
+    predicted = memory.bytes_needed(batch.memory_need(config, 100), 2, together=False)
     assert 0.97 * used < predicted < 1.2 * used
 
 
@@ -195,8 +195,8 @@ def test_values_in_use_at_once_are_counted():
     def fan(x):  # all ten wait for their sum
         return jnp.sum(jnp.stack([jnp.sin(x * k) for k in range(10)]))
 
-    assert batch._most_in_use(jax.make_jaxpr(chain)(kilobyte).jaxpr) <= 2 * 1024 + 4
-    assert batch._most_in_use(jax.make_jaxpr(fan)(kilobyte).jaxpr) >= 20 * 1024
+    assert memory.most_in_use(jax.make_jaxpr(chain)(kilobyte).jaxpr) <= 2 * 1024 + 4
+    assert memory.most_in_use(jax.make_jaxpr(fan)(kilobyte).jaxpr) >= 20 * 1024
 
 
 @pytest.mark.parametrize("num_rounds", [1, 2, 4, 39, 75, 97, 400, 997, 5003, 10_000])
@@ -362,7 +362,7 @@ def test_a_cell_alone_in_a_split_batch_and_beside_a_failing_one(line, train):
     cells = [line.replace(method="peps", seed=seed) for seed in (3, 4, 5)]
     cells[1] = cells[1].replace(learning_rate=float("nan"))
     need = batch.memory_need(cells[0], EPISODES)
-    one_per_device = int((batch.bytes_needed(need, 1, together=False) + 100) / batch.AVAILABLE_SHARE)
+    one_per_device = int((memory.bytes_needed(need, 1, together=False) + 100) / memory.AVAILABLE_SHARE)
     batches = batch.plan(cells, EPISODES, free=one_per_device)
     assert [one.cells for one in batches] == [(0, 1), (2,)]
     reported, finished = [], []

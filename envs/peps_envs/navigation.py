@@ -310,7 +310,7 @@ DOMAINS = {
 }
 
 # What the human thinks instead: unsteady near the pit, slipping on ice and slow there, moving readily on sand.
-DYNAMICS_BIAS = dict(pit_noise=1.5, pit_range=0.35, ice_noise=0.8, ice_gain=0.7, sand_gain=0.77, sand_stuck=0.0)
+DYNAMICS_BIAS = dict(pit_noise=1.5, pit_range=0.35, ice_noise=0.8, ice_gain=0.7, sand_gain=0.95, sand_stuck=0.0)
 
 # What the human wants instead, in the presets with a biased reward: no hurry, and more fear of the pit.
 REWARD_BIAS = dict(step_reward=-0.5, progress_reward=2.0, pit_reward=-200.0)

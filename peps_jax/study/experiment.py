@@ -21,6 +21,7 @@ from peps_jax.study.scenes import BEHAVIOURS, HORIZON, RAIN, behaviour, crashed,
 from peps_jax.train import Result, TrainingState, check, collect_and_ask, finish, improve, init
 
 METHODS = ("peps", "sac", "drlhp", "policy_shaping")
+RATED = METHODS[:3]  # by the paper's participants. A rating says how a scene compares with the others that a rater saw
 STEPS, EPISODES = 20_000, 100  # environment steps of a training, and scenes in which it is seen
 FEW_SEEDS = 3  # at each lambda beside the study's own
 
@@ -161,7 +162,8 @@ class Findings(NamedTuple):
     scenes: dict[str, Segments]  # by method, at the study's own lambda: (seeds * episodes, HORIZON, ...)
     conduct: dict[str, Conduct]  # by method
     over_lam: dict[float, Conduct]  # of PEPS
-    groups: list[Group]  # of raters; the first is the study's own
+    groups: list[Group]  # of raters, who see what the paper's saw; the first is the study's own
+    wider: list[Group]  # the same raters after they have seen every method; none if that is no more
 
 
 Make = Callable[[Part], Seen]  # trains a part's agents, or takes them from where they were kept
@@ -182,5 +184,8 @@ def run(wanted: Sequence[Part], number: int = GROUPS, make: Make = run_part) -> 
                 pool = lambda rows: rows[place, good].reshape(-1, *rows.shape[3:])  # noqa: B023
                 scenes[part.method] = jax.tree.map(pool, seen.scenes)
     print(f"{number} groups of raters", file=sys.stderr, flush=True)
-    rated = groups(jax.random.fold_in(jax.random.key(wanted[0].seeds[0]), 2), scenes, road(RAIN), number)
-    return Findings(scenes, conducts, dict(sorted(over_lam.items())), rated)
+    key = jax.random.fold_in(jax.random.key(wanted[0].seeds[0]), 2)
+    papers = {method: shown for method, shown in scenes.items() if method in RATED}
+    wider = groups(key, scenes, road(RAIN), number) if len(scenes) > len(papers) else []
+    rated = groups(key, papers, road(RAIN), number)
+    return Findings(scenes, conducts, dict(sorted(over_lam.items())), rated, wider)

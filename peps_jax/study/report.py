@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from peps_jax import files, film
 from peps_jax.study.experiment import SETTINGS, Conduct, Findings
-from peps_jax.study.ratings import RATERS
+from peps_jax.study.ratings import RATERS, Group
 from peps_jax.study.scenes import BEHAVIOURS, typical
 
 PICTURE, FILM, NUMBERS, TABLE = "figure3.png", "figure3.gif", "figure3.json", "figure3.md"
@@ -19,12 +20,26 @@ TITLES = {"peps": "PEPS", "sac": "SAC", "drlhp": "DRLHP", "policy_shaping": "pol
 PAPER = {"peps": (7.6, 2.4), "sac": (5.0, 2.3), "drlhp": (5.9, 2.2)}
 
 
-def shares(findings: Findings) -> dict[str, float]:
+def shares(groups: Sequence[Group]) -> dict[str, float]:
     """How many groups of raters rate PEPS highest, how many differ significantly, and both, from 0 to 1."""
-    highest = np.array([max(group.mean, key=group.mean.get) == "peps" for group in findings.groups])
-    significant = np.array([group.p < 0.05 for group in findings.groups])
+    highest = np.array([max(group.mean, key=group.mean.get) == "peps" for group in groups])
+    significant = np.array([group.p < 0.05 for group in groups])
     both = highest & significant
-    return {"highest": highest.mean(), "significant": significant.mean(), "both": both.mean()}
+    return {"highest": float(highest.mean()), "significant": float(significant.mean()), "both": float(both.mean())}
+
+
+def _rated(groups: Sequence[Group]) -> dict[str, Any]:
+    return {"ratings": groups[0]._asdict(), "groups": len(groups), "groups_that": shares(groups)}
+
+
+def _said(groups: Sequence[Group], paper: str = "") -> str:
+    """What the raters' analysis says, in a line."""
+    told, first = shares(groups), groups[0]
+    return (
+        f"one-way ANOVA of the ratings by {RATERS} raters: p = {first.p:.2g}, η² = {first.eta_squared:.2f}{paper}. "
+        f"Of {len(groups)} groups of raters {told['highest']:.0%} rate PEPS highest, {told['significant']:.0%} differ with "
+        f"p < 0.05, both in {told['both']:.0%}."
+    )
 
 
 def summary(findings: Findings) -> dict[str, Any]:
@@ -34,9 +49,8 @@ def summary(findings: Findings) -> dict[str, Any]:
         "conduct": {method: found._asdict() for method, found in findings.conduct.items()},
         "over_lam": [{"lam": lam} | found._asdict() for lam, found in findings.over_lam.items()],
         "lam": SETTINGS["lam"],
-        "ratings": findings.groups[0]._asdict(),
-        "groups": len(findings.groups),
-        "groups_that": {name: float(share) for name, share in shares(findings).items()},
+        **_rated(findings.groups),
+        "wider": _rated(findings.wider) if findings.wider else None,
     }
 
 
@@ -57,19 +71,20 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
 
 def text(findings: Findings) -> str:
     """What was found, in Markdown."""
-    rated = findings.groups[0]
+    columns = {"rating": findings.groups, "rating with all shown": findings.wider}
+    rated = {name: groups[0] for name, groups in columns.items() if groups}
     heads = [*BEHAVIOURS, "crashes", "return"]
+    rating = lambda group, method: f"{group.mean[method]:.1f} ± {group.sd[method]:.1f}" if method in group.mean else ""
     rows = []
     for method, found in findings.conduct.items():
         paper = "{} ± {}".format(*PAPER[method]) if method in PAPER else ""
-        rows.append([TITLES[method], *_behaves(found), f"{rated.mean[method]:.1f} ± {rated.sd[method]:.1f}", paper])
-    told = shares(findings)
+        rows.append([TITLES[method], *_behaves(found), *(rating(group, method) for group in rated.values()), paper])
     parts = [
-        _table(["agent", *heads, "rating", "paper's rating"], rows),
-        f"Agents by what they do in most scenes. One-way ANOVA of the ratings by {RATERS} raters: "
-        f"p = {rated.p:.2g}, η² = {rated.eta_squared:.2f} (paper: p = 0.037). Of {len(findings.groups)} groups of raters "
-        f"{told['highest']:.0%} rate PEPS highest, {told['significant']:.0%} differ with p < 0.05, both in {told['both']:.0%}.",
+        _table(["agent", *heads, *rated, "paper's rating"], rows),
+        f"Agents by what they do in most scenes. Of the paper's agents, {_said(findings.groups, ' (paper: p = 0.037)')}",
     ]
+    if findings.wider:
+        parts.append(f"With all shown, {_said(findings.wider)}")
     if len(findings.over_lam) > 1:
         rows = [[f"{lam:g}", *_behaves(found)] for lam, found in findings.over_lam.items()]
         parts += [f"PEPS over λ, of which the study's is {SETTINGS['lam']:g}:", _table(["λ", *heads], rows)]
@@ -78,7 +93,7 @@ def text(findings: Findings) -> str:
 
 def write(findings: Findings, folder: Path) -> list[Path]:
     """Writes figure3.png, .gif, .json and .md; returns the paths."""
-    rated = findings.groups[0]
+    rated = (findings.wider or findings.groups)[0]
     titles = {
         method: f"{TITLES[method]} (μ = {rated.mean[method]:.1f}, σ = {rated.sd[method]:.1f})"
         for method in findings.scenes

@@ -1,0 +1,117 @@
+"""Compiled programs are found again by another process, and only by one that would make the same."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+from conftest import Line, LineParams
+
+from peps_jax import batch, files, methods, programs
+
+EPISODES = 2
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    monkeypatch.setenv(programs.VARIABLE, str(tmp_path / "kept"))
+    return tmp_path / "kept"
+
+
+def kept(about, make):
+    return programs.kept(about, make, jax.devices()[:1])
+
+
+def double():
+    return {"double": jax.jit(lambda x: 2 * x).lower(np.float32(1)).compile(), "beside": (1, "two")}
+
+
+def refuse():
+    raise AssertionError("made again")
+
+
+def test_what_was_made_is_found_again(place):
+    kept("a", double)
+    found = kept("a", refuse)
+    assert found["double"](np.float32(3)) == 6
+    assert found["beside"] == (1, "two")
+    assert [path.suffix for path in place.iterdir()] == [".program"]
+
+
+@pytest.mark.parametrize("change", ["about", "code", "setting", "flags"])
+def test_what_would_differ_is_made_anew(place, monkeypatch, change):
+    kept("a", double)
+    if change == "code":
+        monkeypatch.setattr(programs, "_code", lambda: "other code")
+    if change == "flags":
+        monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=1")
+    if change == "setting":
+        monkeypatch.setattr(type(jax.config), "values", {"jax_enable_x64": True})
+    kept("b" if change == "about" else "a", lambda: {"number": 1})
+    assert len(list(place.iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda content: content[:-1], lambda content: b"", lambda content: files.seal(b"no pickle")]
+)
+def test_a_damaged_file_is_made_anew(place, damage):
+    kept("a", double)
+    (path,) = place.iterdir()
+    path.write_bytes(damage(path.read_bytes()))
+    assert kept("a", double)["double"](np.float32(3)) == 6
+    assert kept("a", refuse)["double"](np.float32(3)) == 6
+
+
+def test_the_longest_unused_make_room(place, monkeypatch):
+    monkeypatch.setattr(programs, "LIMIT", 3_000)
+    for age, name in enumerate("abc"):
+        kept(name, lambda: {"bytes": b"0" * 1_000})
+        newest = max(place.iterdir(), key=lambda path: path.stat().st_mtime_ns)
+        os.utime(newest, (1_000 - age if name != "c" else 2_000,) * 2)
+    assert len(list(place.iterdir())) == 2
+    kept("a", refuse)
+    with pytest.raises(AssertionError):
+        kept("b", refuse)
+
+
+def test_nothing_is_kept_where_that_is_turned_off_or_impossible(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    for value in ("", str(tmp_path / "file")):
+        monkeypatch.setenv(programs.VARIABLE, value)
+        assert kept("a", double)["double"](np.float32(3)) == 6
+        with pytest.raises(AssertionError):
+            kept("a", refuse)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_foreign_code_has_no_name(tiny, monkeypatch):
+    assert batch._written(tiny) == batch._written(tiny.replace(seed=1, lam=3.0))
+    assert batch._written(tiny) != batch._written(tiny.replace(batch_size=17))
+    assert batch._written(tiny.replace(env=Line(), params=LineParams(), belief=LineParams())) is None
+    mine = methods.get("sac")._replace(name="mine", init=lambda key, config: ())
+    monkeypatch.setitem(methods.METHODS, "mine", mine)
+    assert batch._written(tiny.replace(method="mine")) is None
+
+
+PROGRAM = """
+import sys
+import numpy as np
+from peps_jax import Config, batch, programs
+sizes = dict(total_steps=40, num_envs=4, rollout_length=10, warmup_steps=0, batch_size=8, hidden_sizes=(4,), updates_per_step=0.1)
+cells = [Config(method="sac", seed=seed, **sizes) for seed in range(2)]
+(planned,) = batch.plan(cells, 2)
+if sys.argv[1] == "known":
+    batch.Program._compile = None
+program, _ = batch.program(cells[0], planned, 2)
+finished, _ = program.run(cells)
+print([one.evaluation.return_.tolist() for one in finished], program.bytes_used)
+"""
+
+
+def test_another_process_finds_a_trainings_programs(place):
+    run = lambda word: (
+        subprocess.run([sys.executable, "-c", PROGRAM, word], capture_output=True, text=True, check=True).stdout
+    )
+    assert run("new") == run("known")
