@@ -309,7 +309,8 @@ DOMAINS = {
     "d4": _CROSSING | dict(sand_gain=0.67),
 }
 
-# What the human thinks instead: unsteady near the pit, slipping on ice and slow there, moving readily on sand.
+# What the human thinks instead: unsteady near the pit, slipping on ice and slow there, moving readily on sand. So readily that
+# the agent's slower steps there surprise it as well: the sand is worth its way from a lambda between 1 and 2 on.
 DYNAMICS_BIAS = dict(pit_noise=1.5, pit_range=0.35, ice_noise=0.8, ice_gain=0.7, sand_gain=0.95, sand_stuck=0.0)
 
 # What the human wants instead, in the presets with a biased reward: no hurry, and more fear of the pit.

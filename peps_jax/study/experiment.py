@@ -22,12 +22,12 @@ from peps_jax.train import Result, TrainingState, check, collect_and_ask, finish
 
 METHODS = ("peps", "sac", "drlhp", "policy_shaping")
 RATED = METHODS[:3]  # by the paper's participants. A rating says how a scene compares with the others that a rater saw
-STEPS, EPISODES = 20_000, 100  # environment steps of a training, and scenes in which it is seen
+STEPS, EPISODES = 30_000, 100  # environment steps of a training, and scenes in which it is seen
 FEW_SEEDS = 3  # at each lambda beside the study's own
 
 # A scene pays about 7, where a way through navigation's maze pays about 100: entropies weigh less, rewards needn't be scaled.
 SETTINGS = dict(
-    lam=2.0, gamma=0.99, num_envs=16, rollout_length=24, warmup_steps=1_920,
+    lam=2.0, gamma=0.99, num_envs=16, rollout_length=24, warmup_steps=1_920, updates_per_step=0.5,
     hold_steps=2, reward_scale=0.25, policy_entropy_weight=0.02, initial_temperature=2.0, temperature=0.01,
     segment_length=HORIZON, num_queries=TRAINERS * ANSWERS, surrogate_learning_rate=2e-3,
 )  # fmt: skip
