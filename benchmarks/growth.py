@@ -69,21 +69,13 @@ def sizes(base: Config, values: dict[str, Sequence[int]], repeats: int) -> dict[
     }
 
 
-def compilation(quick: bool) -> dict[str, float]:
-    """Seconds that a sweep of known structure compiles in a fresh process: as it is, and with JAX's persistent cache on.
-
-    `again` is the same command a second time, without anything set; `warm` with the cache that `cold` filled.
-    """
+def compilation() -> dict[str, float]:
+    """Seconds that a sweep compiles in a fresh process: `cold`, and `warm` in the next, which finds what the first one kept."""
     with tempfile.TemporaryDirectory() as folder:
         home = pathlib.Path(folder)
-        alone = {"HOME": str(home), "XDG_CACHE_HOME": str(home / "cache")}
-        first = _sweep(alone, home / "first")
-        again = first if quick else _sweep(alone, home / "again")
-        if again < 0.5 * first:  # it keeps what it compiled by itself
-            return {"first": first, "again": again, "cold": first, "warm": again}
-        kept = alone | {"JAX_COMPILATION_CACHE_DIR": str(home / "compiled")}
-        cold, warm = (_sweep(kept, home / f"kept{number}") for number in range(2))
-    return {"first": first, "again": again, "cold": cold, "warm": warm}
+        alone = {"PEPS_JAX_CACHE": str(home / "kept")}
+        cold, warm = (_sweep(alone, home / name) for name in ("first", "again"))
+    return {"cold": cold, "warm": warm}
 
 
 def _sweep(surroundings: dict[str, str], out: pathlib.Path) -> float:
@@ -114,5 +106,5 @@ def measure(quick: bool) -> dict[str, Any]:
     return {
         "seeds": seeds(base, most, repeats),
         **sizes(base, values, repeats),
-        "compilation": compilation(quick),
+        "compilation": compilation(),
     }

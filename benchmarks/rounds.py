@@ -24,6 +24,7 @@ PARTS = {  # as the text calls them
     "value": "r̂ and entropies of the minibatches",
     "improve": "SAC's updates",
 }
+AT_ONCE = "value at once"  # tried: r-hat and entropies of all of a round's minibatches in one piece
 
 
 def prepare(config: Config) -> tuple[TrainingState, Trajectory, Preferences | None, Transition]:
@@ -39,7 +40,7 @@ def prepare(config: Config) -> tuple[TrainingState, Trajectory, Preferences | No
 
 
 def parts(structure: Config) -> dict[str, Callable[..., Any]]:
-    """What a round of PEPS does, by the names of `PARTS`; of SAC, what it does of that. Last, the `whole` of it."""
+    """What a round of PEPS does, by the names of `PARTS`; of SAC, what it does of that; `AT_ONCE`; and the `whole`."""
     index, key = jnp.int32(structure.num_rounds // 2), jax.random.key(1)
     filled = (index + 1) * structure.steps_per_round
     plain = lambda config: config.replace(method="sac")  # asks nothing, and takes rewards as they are
@@ -62,13 +63,22 @@ def parts(structure: Config) -> dict[str, Callable[..., Any]]:
             lambda batch: peps.reward(state.knowledge, batch, config), batches, batch_size=VALUED_TOGETHER
         )
 
+    def value_at_once(state, trajectory, preferences, batches, config):
+        return peps.reward(state.knowledge, batches, config)
+
     def update(state, trajectory, preferences, batches, config):
         return improve(state, index, key, plain(config))
 
     def whole(state, trajectory, preferences, batches, config):
         return run_round(state, index, config)
 
-    learned = {"ask": ask, "fit_dynamics": fit_dynamics, "fit_surrogate": fit_surrogate, "value": value}
+    learned = {
+        "ask": ask,
+        "fit_dynamics": fit_dynamics,
+        "fit_surrogate": fit_surrogate,
+        "value": value,
+        AT_ONCE: value_at_once,
+    }
     return {"collect": collect} | (learned if structure.method == "peps" else {}) | {"improve": update, "whole": whole}
 
 

@@ -250,6 +250,13 @@ def test_a_line_of_known_scores():
     assert everywhere["explicability"] == 5.0, "as many seeds of each domain as the fewest"
 
 
+@pytest.mark.parametrize(
+    ("values", "needed"), [([1.0, 2.0, 3.0], 100 * np.sqrt(10)), ([1.5, 0.0, 0.0], 100), ([0.0, 1.0, 1.4], np.inf)]
+)
+def test_the_queries_that_it_takes(values, needed):
+    assert figures.queries_needed([100, 1000, 10_000], values, 1.5) == pytest.approx(needed)
+
+
 def test_one_seed_has_no_interval():
     made = tables.line(["nav-d1"], "peps", [[made_up(1.0)]], trained=2)
     assert math.isnan(made["return"])
@@ -277,7 +284,7 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
     assert call(["all", "--seeds", 3, "--out", tmp_path], tiny) == 0
     written = {path.name for path in tmp_path.iterdir()} - {store.HEAD, store.CELLS}
     pictures = ("figure1", "figure2", "frontier", "queries")
-    assert written == {"improvement.csv"} | {
+    assert written == {"improvement.csv", "queries.md"} | {
         f"{name}.{kind}" for name in pictures for kind in ("png", "pdf", "csv")
     } | {f"{name}.{kind}" for name in ("table1", "ablations") for kind in ("md", "csv", "tex")}
     lines = lines_of(tmp_path / "table1.csv")

@@ -20,6 +20,7 @@ from peps_jax.command_line import Parser, options, refuse, use_every_core
 from peps_jax.config import Config
 from peps_jax.files import NotWrittenError
 from peps_jax.reproduce import driving, figures, tables
+from peps_jax.reproduce.figures import QUERY_SEEDS
 from peps_jax.reproduce.store import Store
 from peps_jax.reproduce.study import DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
 from peps_jax.study.experiment import STEPS
@@ -65,7 +66,7 @@ def parser() -> Parser:
     """The command line's parser."""
     texts = "\n".join(f"  {name:10} {result.text}" for name, result in RESULTS.items())
     groups = "\n".join(f"  {name:10} {', '.join(members)}" for name, members in GROUPS.items())
-    epilog = f"results:\n{texts}\n{groups}\n\nfrontier, queries and ablations take the first {FEW_SEEDS} seeds."
+    epilog = f"results:\n{texts}\n{groups}\n\nfrontier and ablations take the first {FEW_SEEDS} seeds, queries {QUERY_SEEDS}."
     made = Parser(
         prog=PROG, usage=f"{PROG} [RESULT ...] [flags]", description=DESCRIPTION, epilog=epilog, allow_abbrev=False,
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -13,7 +13,8 @@ import peps_envs
 from peps_jax import files, plots, results
 from peps_jax.reproduce.store import Record
 from peps_jax.reproduce.study import BASELINES, DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
-from peps_jax.reproduce.tables import SCORES, TITLES, Line, interval
+from peps_jax.reproduce.tables import SCORES, TITLES, Line, interval, markdown, with_interval
+from peps_jax.statistics import Estimate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,6 +25,8 @@ PLANNED_LAMS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # of the planner's curve, b
 QUERY_DOMAINS = ("nav-d1", "nav-d2", "nav-d4")  # where there is explicability to gain
 STRATEGIES = {"information_gain": "#c2255c", "disagreement": "#1c6dd0", "random": "#5c6770"}  # their colours
 SHARES = (30, 10, 3, 1)  # of the study's queries, one in so many
+QUERY_SEEDS = 6  # what tells one strategy from another is small
+REACHED = 0.9  # of the way from SAC's to the planner's explicability: how many queries does it take?
 
 
 def _save(figure: Figure, lines: Sequence[Line], folder: Path, name: str) -> list[Path]:
@@ -240,13 +243,17 @@ def _budgets(study: Study) -> list[int]:
 
 
 def _asked(study: Study, domain: str, strategy: str, budget: int) -> list[Training]:
-    return study.trainings(domain, "peps", FEW_SEEDS, query_strategy=strategy, num_queries=budget)
+    return study.trainings(domain, "peps", QUERY_SEEDS, query_strategy=strategy, num_queries=budget)
+
+
+def _unasked(study: Study, domain: str) -> list[Training]:
+    return study.trainings(domain, "sac", QUERY_SEEDS)
 
 
 def queries_needs(study: Study) -> list[Training | Planned]:
     """PEPS with every strategy and budget; SAC, which asks nothing; and the planner's bound."""
     plans = [study.planned(domain, "peps") for domain in QUERY_DOMAINS]
-    cells = [cell for domain in QUERY_DOMAINS for cell in study.trainings(domain, "sac", FEW_SEEDS)]
+    cells = [cell for domain in QUERY_DOMAINS for cell in _unasked(study, domain)]
     for strategy in STRATEGIES:
         for budget in _budgets(study):
             cells += [cell for domain in QUERY_DOMAINS for cell in _asked(study, domain, strategy, budget)]
@@ -254,14 +261,14 @@ def queries_needs(study: Study) -> list[Training | Planned]:
 
 
 def queries(study: Study, folder: Path) -> list[Path]:
-    """Explicability against the number of queries, a line for each strategy."""
+    """queries.{md,csv,png,pdf}: explicability against the number of queries, a line for each strategy."""
     figure, panels = plots.panels_of(1, len(QUERY_DOMAINS), 3.3, 2.8)
     lines = []
     for axes, domain in zip(panels[0], QUERY_DOMAINS, strict=True):
         plots.tidy(axes)
         levels = {
             "planner": (_explicability(study.record(study.planned(domain, "peps"))), plots.INK),
-            "SAC": (_estimates(study.records(study.trainings(domain, "sac", FEW_SEEDS)))["explicability"], plots.QUIET),
+            "SAC": (_estimates(study.records(_unasked(study, domain)))["explicability"], plots.QUIET),
         }
         for name, (level, colour) in levels.items():
             axes.axhline(level, color=colour, linewidth=0.9, linestyle=(0, (4, 3)), label=name)
@@ -284,4 +291,42 @@ def queries(study: Study, folder: Path) -> list[Path]:
     panels[0, 0].set_ylabel("explicability", color=plots.INK, fontsize=9)
     handles, texts = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, texts, frameon=False, fontsize=8, loc="outside lower center", ncols=len(texts))
-    return _save(figure, lines, folder, "queries")
+    text = folder / "queries.md"
+    files.write_whole(text, _queries_table(lines).encode())
+    return [*_save(figure, lines, folder, "queries"), text]
+
+
+def queries_needed(budgets: Sequence[int], values: Sequence[float], target: float) -> float:
+    """Where the line through `values` over the logarithm of `budgets` first reaches `target`; inf if it doesn't."""
+    above = np.flatnonzero(np.asarray(values) >= target)
+    if not above.size:
+        return np.inf
+    if above[0] == 0:
+        return float(budgets[0])
+    place = slice(above[0] - 1, above[0] + 1)
+    return float(np.exp(np.interp(target, values[place], np.log(budgets[place]))))
+
+
+def _queries_table(lines: Sequence[Line]) -> str:
+    budgets = sorted({line["queries"] for line in lines if "queries" in line})
+    rows = []
+    for domain in QUERY_DOMAINS:
+        own = [line for line in lines if line["domain"] == domain]
+        level = {line["strategy"]: line["explicability"] for line in own if "queries" not in line}
+        target = level["SAC"] + REACHED * (level["planner"] - level["SAC"])
+        for strategy in STRATEGIES:
+            points = [line for line in own if line["strategy"] == strategy]
+            needed = queries_needed(budgets, [point["explicability"] for point in points], target)
+            shown = [
+                with_interval(Estimate(*(point[f"explicability{end}"] for end in ("", "_low", "_high"))))
+                for point in points
+            ]
+            told = f"more than {budgets[-1]:,}" if np.isinf(needed) else f"{needed:,.0f}"
+            rows.append([_title(domain), strategy.replace("_", " "), *shown, told])
+    head = ["domain", "queries chosen by", *(f"{budget:,}" for budget in budgets), f"to {REACHED:.0%} of the way"]
+    note = (
+        f"Explicability: interquartile mean over up to {QUERY_SEEDS} seeds, with its 95 % interval. Last, how many it takes "
+        "for so much of the way from SAC's explicability to the planner's: between the numbers looked at by a straight line "
+        "over their logarithm.\n"
+    )
+    return "\n".join([markdown(head, rows), note])
