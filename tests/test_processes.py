@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from commands import contents, exit_code
 
 import peps_envs
 from peps_jax import batch, plots, processes, results, sweep
@@ -23,18 +24,8 @@ SIZES = [
 LINE = ["--env", "line", "--method", "sac", "--seeds", "8", *SIZES]  # four batches of two cells
 
 
-def call(*arguments: str) -> int:
-    try:
-        return sweep.main([*map(str, arguments)])
-    except SystemExit as exit:
-        return exit.code
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    """What a sweep's folder has to say: all its files but the manifest, which holds times."""
-    found = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()}
-    found.pop(results.MANIFEST, None)
-    return {name: path.read_bytes() for name, path in found.items()}
+def call(*arguments: object) -> int:
+    return exit_code(sweep.main, *arguments)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import math
 import jax
 import numpy as np
 import pytest
+from commands import exit_code, is_one_complaint
 
 from peps_jax import Config, batch, plots
 from peps_jax.reproduce import __main__ as command
@@ -16,16 +17,11 @@ from peps_jax.reproduce.study import DOMAINS, METHODS, Study
 from peps_jax.statistics import Estimate
 from peps_jax.study import experiment
 
-PREFIX = "python -m peps_jax.reproduce: error: "
 EPISODES = 4
 
 
 def call(arguments, tiny) -> int:
-    """The exit code of a command line."""
-    try:
-        return command.main(list(map(str, arguments)), tiny, EPISODES)
-    except SystemExit as exit:
-        return exit.code
+    return exit_code(lambda arguments: command.main(arguments, tiny, EPISODES), *arguments)
 
 
 @pytest.fixture
@@ -83,11 +79,7 @@ def lines_of(path) -> list[dict[str, str]]:
 )
 def test_bad_input_is_one_line(arguments, parts, tmp_path, capsys, tiny, no_training):
     assert call([*arguments.split(), "--out", tmp_path / "out"], tiny) == 2
-    captured = capsys.readouterr()
-    assert captured.err.startswith(PREFIX)
-    assert captured.err.count("\n") == 1
-    assert all(part in captured.err for part in parts), captured.err
-    assert not captured.out
+    assert is_one_complaint(capsys.readouterr(), command.PROG, parts)
     assert not list(tmp_path.iterdir())
 
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import exit_code, is_one_complaint
 
 from peps_envs.highway.vehicle import FASTER, IDLE, LANE_LEFT, SLOWER
 from peps_jax import film
@@ -226,15 +227,8 @@ def test_the_studys_lambda_has_all_seeds_and_others_few():
     ],
 )
 def test_bad_input_is_one_line(arguments, parts, tmp_path, capsys):
-    try:
-        code = command.main([*arguments.split(), "--out", str(tmp_path / "out")])
-    except SystemExit as exit:
-        code = exit.code
-    assert code == 2
-    captured = capsys.readouterr()
-    assert captured.err.startswith(f"{command.PROG}: error: ")
-    assert captured.err.count("\n") == 1
-    assert all(part in captured.err for part in parts), captured.err
+    assert exit_code(command.main, *arguments.split(), "--out", tmp_path / "out") == 2
+    assert is_one_complaint(capsys.readouterr(), command.PROG, parts)
     assert not list(tmp_path.iterdir())
 
 

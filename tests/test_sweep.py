@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import exit_code, is_one_complaint
 
 import peps_envs
 import peps_jax
 from peps_jax import batch, memory, plots, results, sweep
 from peps_jax.train import finish, init
 
-PREFIX = "python -m peps_jax.sweep: error: "
 EPISODES = 4
 
 
@@ -36,11 +36,7 @@ def tiny_flags(tiny) -> list[str]:
 
 
 def call(arguments: list[str]) -> int:
-    """The exit code of a command line."""
-    try:
-        return sweep.main(arguments)
-    except SystemExit as exit:
-        return exit.code
+    return exit_code(sweep.main, *arguments)
 
 
 def refuse_to_compile(*arguments):
@@ -79,11 +75,7 @@ def refuse_to_compile(*arguments):
 def test_bad_input_is_one_line(arguments, parts, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(batch, "Program", refuse_to_compile)
     assert call([*arguments.split(), "--out", str(tmp_path / "out")]) == 2
-    captured = capsys.readouterr()
-    assert captured.err.startswith(PREFIX)
-    assert captured.err.count("\n") == 1
-    assert all(part in captured.err for part in parts), captured.err
-    assert not captured.out
+    assert is_one_complaint(capsys.readouterr(), sweep.PROG, parts)
     assert not list(tmp_path.iterdir())
 
 
