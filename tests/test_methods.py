@@ -1,6 +1,7 @@
 """The methods: what each learns from, in which world, and how its policies act together."""
 
 import chex
+import distrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +13,7 @@ from peps_envs import Discrete
 from peps_jax import Config, methods
 from peps_jax.methods import drlhp
 from peps_jax.parts import sac
+from peps_jax.parts.trajectory import Transition
 from peps_jax.train import collect_and_ask, init
 
 EVERY = ("peps", "sac", "drlhp", "policy_shaping", "human")
@@ -24,11 +26,23 @@ def evaluate():
 
 
 def test_the_methods_and_their_order():
-    assert tuple(methods.METHODS) == (*EVERY, "drlhp_unscaled")
+    assert tuple(methods.METHODS) == (*EVERY, "drlhp_unscaled", "peps_absolute")
     text = Config.__dataclass_fields__["method"].metadata["help"]
     places = [text.index(name) for name in ("peps", " sac", "drlhp", "policy_shaping", "human")]
     assert places == sorted(places)
     assert [name for name in EVERY if methods.get(name).uses_lam] == ["peps"]
+
+
+def test_absolute_entropies_are_more_by_those_of_what_relative_ones_are_measured_against(tiny):
+    environment, params, _ = tiny.task()
+    knowledge = methods.get("peps").init(jax.random.key(0), tiny)
+    step = Transition(jnp.zeros(environment.observation_size), jnp.zeros(2), jnp.ones(()), jnp.zeros(()), jnp.zeros(()))
+    absolute, relative = (
+        methods.get(name).rewards[0](knowledge, step, tiny.replace(lam=2.0)) for name in ("peps_absolute", "peps")
+    )
+    kernel = distrax.MultivariateNormalDiag(jnp.zeros(2), environment.perception_width(params)).entropy()
+    uniform = distrax.Independent(distrax.Uniform(-jnp.ones(2), jnp.ones(2)), 1).entropy()
+    np.testing.assert_allclose(absolute - relative, 2.0 * (kernel + tiny.policy_entropy_weight * uniform), rtol=1e-4)
 
 
 # --- the product of policies ----------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import math
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -21,12 +22,22 @@ class Box:
 
     size: int
 
+    @property
+    def uniform_entropy(self) -> float:
+        """Differential entropy of the uniform policy, in nats."""
+        return self.size * math.log(2.0)
+
 
 @dataclasses.dataclass(frozen=True)
 class Discrete:
     """Actions 0, ..., size - 1."""
 
     size: int
+
+    @property
+    def uniform_entropy(self) -> float:
+        """Entropy of the uniform policy, in nats."""
+        return math.log(self.size)
 
 
 ActionSpace = Box | Discrete

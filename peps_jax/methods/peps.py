@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 import jax
+import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
@@ -64,3 +67,19 @@ PEPS = Method(
     # SAC's own temperature explores; Eq. (6)'s comes on top, so that at lambda = 0 PEPS is SAC
     entropy_weight=lambda config: config.lam * config.policy_entropy_weight,
 )
+
+
+def absolute_reward(knowledge: Knowledge, transitions: Transition, config: Config) -> Array:
+    """`reward` with Eq. (6)'s entropies as they are defined, and not against the perceptual kernel and the uniform policy.
+
+    They are more by a constant per step, H of the kernel, n/2 log(2 pi e) + sum_i log sigma_p,i, and H of the uniform policy.
+    """
+    environment, params, _ = config.task()
+    width = environment.perception_width(params)
+    kernel = 0.5 * width.shape[0] * math.log(2 * math.pi * math.e) + jnp.sum(jnp.log(width))
+    uniform = environment.action_space.uniform_entropy
+    constant = config.environment_entropy_weight * kernel + config.policy_entropy_weight * uniform
+    return reward(knowledge, transitions, config) + config.lam * constant
+
+
+PEPS_ABSOLUTE = PEPS._replace(name="peps_absolute", rewards=(absolute_reward,))  # an ablation

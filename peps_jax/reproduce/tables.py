@@ -252,6 +252,7 @@ def variants(base: Config) -> dict[str, tuple[str, dict[str, Any]]]:
         "PEPS": ("peps", {}),
         "without environment entropy": ("peps", {"environment_entropy_weight": 0.0}),
         "without policy entropy": ("peps", {"policy_entropy_weight": 0.0}),
+        "absolute entropies": ("peps_absolute", {}),
         "r̂'s 0.95 quantile at 0": ("peps", {"level": "quantile"}),
         "r̂'s maximum at 0": ("peps", {"level": "max"}),
         "r̂'s mean at 0, deviation 1": ("peps", {"level": "standard"}),
