@@ -309,9 +309,11 @@ DOMAINS = {
     "d4": _CROSSING | dict(sand_gain=0.67),
 }
 
-# What the human thinks instead: unsteady near the pit, slipping on ice and slow there, moving readily on sand. So readily that
-# the agent's slower steps there surprise it as well: the sand is worth its way from a lambda between 1 and 2 on.
-DYNAMICS_BIAS = dict(pit_noise=1.5, pit_range=0.35, ice_noise=0.8, ice_gain=0.7, sand_gain=0.95, sand_stuck=0.0)
+# What the human thinks instead: unsteady near the pit, slipping on ice and slow there, moving readily on sand. In D4 so readily
+# that the agent's slower steps there surprise it too: the sand is worth its way from a lambda between 1 and 2 on, not from 0.5.
+# In D3, where the agent is stuck, the same made PEPS loiter in two of ten trainings.
+_BIAS = dict(pit_noise=1.5, pit_range=0.35, ice_noise=0.8, ice_gain=0.7, sand_gain=0.77, sand_stuck=0.0)
+DYNAMICS_BIAS = {"d1": _BIAS, "d2": _BIAS, "d3": _BIAS, "d4": _BIAS | dict(sand_gain=0.95)}
 
 # What the human wants instead, in the presets with a biased reward: no hurry, and more fear of the pit.
 REWARD_BIAS = dict(step_reward=-0.5, progress_reward=2.0, pit_reward=-200.0)
@@ -324,5 +326,6 @@ def domain(name: str) -> tuple[NavigationParams, dict[str, NavigationParams]]:
     `both` has both biases.
     """
     truth = DOMAINS[name]
-    beliefs = {"biased": DYNAMICS_BIAS, "unbiased": {}, "reward": REWARD_BIAS, "both": DYNAMICS_BIAS | REWARD_BIAS}
-    return make_params(**truth), {belief: make_params(**(truth | bias)) for belief, bias in beliefs.items()}
+    bias = DYNAMICS_BIAS[name]
+    beliefs = {"biased": bias, "unbiased": {}, "reward": REWARD_BIAS, "both": bias | REWARD_BIAS}
+    return make_params(**truth), {belief: make_params(**(truth | told)) for belief, told in beliefs.items()}

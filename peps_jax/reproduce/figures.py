@@ -25,7 +25,7 @@ PLANNED_LAMS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # of the planner's curve, b
 QUERY_DOMAINS = ("nav-d1", "nav-d2", "nav-d4")  # where there is explicability to gain
 STRATEGIES = {"information_gain": "#c2255c", "disagreement": "#1c6dd0", "random": "#5c6770"}  # their colours
 SHARES = (30, 10, 3, 1)  # of the study's queries, one in so many
-QUERY_SEEDS = 6  # what tells one strategy from another is small
+QUERY_SEEDS = 5  # what tells one strategy from another is small
 REACHED = 0.9  # of the way from SAC's to the planner's explicability: how many queries does it take?
 
 
