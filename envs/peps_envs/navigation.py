@@ -310,7 +310,7 @@ DOMAINS = {
 }
 
 # What the human thinks instead: unsteady near the pit, slipping on ice and slow there, moving readily on sand. In D4 so readily
-# that the agent's slower steps there surprise it too: the sand is worth its way from a lambda between 1 and 2 on, not from 0.5.
+# that the agent's slower steps there surprise it too: the sand is worth its way from a lambda between 1 and 2.4 on, not from 0.5.
 # In D3, where the agent is stuck, the same made PEPS loiter in two of ten trainings.
 _BIAS = dict(pit_noise=1.5, pit_range=0.35, ice_noise=0.8, ice_gain=0.7, sand_gain=0.77, sand_stuck=0.0)
 DYNAMICS_BIAS = {"d1": _BIAS, "d2": _BIAS, "d3": _BIAS, "d4": _BIAS | dict(sand_gain=0.95)}
