@@ -31,4 +31,4 @@ def test_without_bias_peps_takes_the_agents_own_way_and_with_it_the_humans():
     assert explicability[0] == returns[0], "nothing surprises who believes the truth"
     mean = lambda values: sum(values) / len(values)
     assert mean(returns[0]) > mean(returns[1]) + 1
-    assert mean(explicability[1]) > 91
+    assert mean(explicability[1]) > 89
