@@ -168,7 +168,7 @@ def test_predicted_memory_grows_as_what_it_counts(line):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "width", "size"), [("sac", 32, 64), ("sac", 128, 256), ("peps", 64, 256)])
+@pytest.mark.parametrize(("method", "width", "size"), [("sac", 128, 256), ("peps", 64, 256)])
 def test_predicted_memory_is_what_xla_reports(method, width, size):
     config = peps_jax.Config(method=method, hidden_sizes=(width, width), batch_size=size, total_steps=32_000)
     used = batch.Program(config, 2, 100, jax.devices()[:1]).bytes_used
