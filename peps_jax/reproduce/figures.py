@@ -283,6 +283,10 @@ def queries(study: Study, folder: Path) -> list[Path]:
             axes.fill_between(_budgets(study), low, high, color=colour, alpha=0.13, linewidth=0)
             name = strategy.replace("_", " ")
             axes.plot(_budgets(study), value, color=colour, linewidth=1.6, marker="o", markersize=4, label=name)
+        base, gap = levels["SAC"][0], levels["planner"][0] - levels["SAC"][0]
+        # a training that goes astray is far below: its interval runs out of the picture, and stands in the table
+        if gap > 0:
+            axes.set_ylim(base - 0.8 * gap, base + 1.2 * gap)
         axes.set_xscale("log")
         axes.set_xticks(_budgets(study), [f"{budget:,}" for budget in _budgets(study)])
         axes.minorticks_off()
