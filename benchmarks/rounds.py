@@ -14,7 +14,7 @@ from peps_jax import Config, batch, methods, rollout
 from peps_jax.methods import feedback, peps
 from peps_jax.parts import dynamics, human, replay, sac
 from peps_jax.parts.trajectory import Preferences, Trajectory, Transition
-from peps_jax.train import VALUED_TOGETHER, TrainingState, collect_and_ask, improve, init, run_round, run_rounds
+from peps_jax.train import TrainingState, collect_and_ask, improve, init, run_round, run_rounds, value
 
 PARTS = {  # as the text calls them
     "collect": "collecting",
@@ -58,10 +58,8 @@ def parts(structure: Config) -> dict[str, Callable[..., Any]]:
     def fit_surrogate(state, trajectory, preferences, batches, config):
         return feedback.learn(state.knowledge.surrogate, state.replay, filled, preferences, index, (key, key), config)
 
-    def value(state, trajectory, preferences, batches, config):
-        return jax.lax.map(
-            lambda batch: peps.reward(state.knowledge, batch, config), batches, batch_size=VALUED_TOGETHER
-        )
+    def value_parts(state, trajectory, preferences, batches, config):
+        return value(peps.reward, state.knowledge, batches, config)
 
     def value_at_once(state, trajectory, preferences, batches, config):
         return peps.reward(state.knowledge, batches, config)
@@ -76,7 +74,7 @@ def parts(structure: Config) -> dict[str, Callable[..., Any]]:
         "ask": ask,
         "fit_dynamics": fit_dynamics,
         "fit_surrogate": fit_surrogate,
-        "value": value,
+        "value": value_parts,
         AT_ONCE: value_at_once,
     }
     return {"collect": collect} | (learned if structure.method == "peps" else {}) | {"improve": update, "whole": whole}

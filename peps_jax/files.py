@@ -10,7 +10,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +141,13 @@ def checksums(folder: Path) -> dict[str, str]:
     """The SHA-256 of every file in `folder`, by its path inside."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return {path.relative_to(folder).as_posix(): digest(path.read_bytes()) for path in files}
+
+
+def sources(root: Path, names: Sequence[str] = ("",)) -> dict[str, str]:
+    """The text of Python files by their path inside `root`: those named, and all inside of folders named."""
+    named = (root / name for name in names)
+    found = [path for one in named for path in (sorted(one.rglob("*.py")) if one.is_dir() else [one])]
+    return {path.relative_to(root).as_posix(): path.read_text() for path in found}
 
 
 def json_bytes(value: Mapping[str, Any]) -> bytes:

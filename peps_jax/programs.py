@@ -98,9 +98,7 @@ def _make_room(place: Path) -> None:
 def _code() -> str:
     """A digest of all code of both packages."""
     roots = [Path(__file__).parent, Path(peps_envs.__file__).parent]
-    return files.json_digest(
-        [(path.relative_to(root).as_posix(), path.read_text()) for root in roots for path in sorted(root.rglob("*.py"))]
-    )
+    return files.json_digest([files.sources(root) for root in roots])
 
 
 @functools.cache

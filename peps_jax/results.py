@@ -240,6 +240,12 @@ def table(records: Sequence[Mapping[str, Any]]) -> bytes:
     return buffer.getvalue().encode()
 
 
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    shown = lambda cells: "| " + " | ".join(cells) + " |"
+    return "\n".join([shown(head), "|" + "---|" * len(head), *map(shown, rows)]) + "\n"
+
+
 # --- reading --------------------------------------------------------------------------------------------------------------
 
 

@@ -144,12 +144,18 @@ def improve(
     agents, infos = [], []
     for agent, reward, key in zip(state.agents, method.rewards, _keys(key_update, len(method.rewards)), strict=True):
         # before the updates: what the method knows doesn't change within a round
-        value = lambda batch, reward=reward: reward(state.knowledge, batch, config) * config.reward_scale
-        valued = batches._replace(reward=jax.lax.map(value, batches, batch_size=VALUED_TOGETHER))
+        valued = batches._replace(reward=value(reward, state.knowledge, batches, config) * config.reward_scale)
         agent, info = jax.lax.scan(update, agent, (valued, jax.random.split(key, config.updates_per_round)))
         agents.append(agent)
         infos.append(info)
     return tuple(agents), jax.tree.map(lambda *values: jnp.mean(jnp.stack(values)), *infos)
+
+
+def value(
+    reward: Callable[[Any, Transition, Config], Array], knowledge: Any, batches: Transition, config: Config
+) -> Array:
+    """A method's `reward` of minibatches (n, size), `VALUED_TOGETHER` at a time."""
+    return jax.lax.map(lambda batch: reward(knowledge, batch, config), batches, batch_size=VALUED_TOGETHER)
 
 
 def annealed_temperature(index: Array, config: Config) -> Array:

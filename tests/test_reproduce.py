@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from commands import exit_code, is_one_complaint
 
-from peps_jax import Config, batch, plots
+from peps_jax import Config, batch, plots, results
 from peps_jax.reproduce import __main__ as command
 from peps_jax.reproduce import driving, figures, store, study, tables
 from peps_jax.reproduce.store import Record, Store
@@ -221,7 +221,7 @@ def test_numbers_in_a_table():
 
 def test_markdown_and_latex():
     head, rows = ["a", "b", "c"], [["x", "50 %", "1 ± 2"], ["x", "a_b", "–"], ["y", "r̂", "λ"]]
-    assert tables.markdown(head, rows).splitlines()[1:3] == ["|---|---|---|", "| x | 50 % | 1 ± 2 |"]
+    assert results.markdown(head, rows).splitlines()[1:3] == ["|---|---|---|", "| x | 50 % | 1 ± 2 |"]
     text = tables.latex(head, rows)
     assert text.startswith("\\begin{tabular}{llr}\n\\toprule\na & b & c \\\\\n\\midrule\n")
     assert r"x & 50 \% & 1 $\pm$ 2 \\" in text
@@ -311,6 +311,11 @@ def test_a_stopped_table_continues(tmp_path, capsys, tiny, monkeypatch):
         return compiled(cell, *arguments)
 
     monkeypatch.setattr(batch, "program", interrupt_the_last)
+    made, kept = Study(tiny, 2, EPISODES), Store(tmp_path, tiny, EPISODES, 2)
+    kept.open()
+    for objective in ("peps", "human"):  # one plan is enough to compile
+        plan = made.planned("nav-d1", objective)
+        kept.save(plan.name, plan.recipe, made_up(80.0))
     arguments = ["table1", "--seeds", 2, "--out", tmp_path]
     assert call(arguments, tiny) == 130
     assert "the same command continues" in capsys.readouterr().err

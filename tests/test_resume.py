@@ -17,7 +17,7 @@ import pytest
 from commands import contents, exit_code
 
 import peps_envs
-from peps_jax import batch, checkpoint, files, ledger, plots, results, sweep
+from peps_jax import batch, checkpoint, files, ledger, plots, programs, results, sweep
 from peps_jax.train import init
 
 PREFIX = "python -m peps_jax.sweep: error: "
@@ -201,6 +201,7 @@ def compiled(tmp_path_factory):
     """The environment of processes that share what they compile."""
     cache = str(tmp_path_factory.mktemp("compiled"))
     return os.environ | {
+        programs.VARIABLE: cache,
         "JAX_COMPILATION_CACHE_DIR": cache,
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",

@@ -1,5 +1,6 @@
 """The driving study: who takes part, what they are asked, what is seen in a scene, and how it is rated and drawn."""
 
+import functools
 import json
 
 import jax
@@ -248,6 +249,7 @@ def test_a_small_study_from_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(experiment, "SETTINGS", experiment.SETTINGS | small)
     monkeypatch.setattr(experiment, "EPISODES", 8)
     monkeypatch.setattr(experiment, "METHODS", ("peps", "sac"))
+    monkeypatch.setattr(experiment, "run", functools.partial(experiment.run, number=3))
     assert command.main(["--seeds", "1", "--steps", "80", "--lams", "2", "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} == set(command.FILES)
     numbers = json.loads((tmp_path / report.NUMBERS).read_text())

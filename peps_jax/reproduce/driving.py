@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,7 @@ import numpy as np
 import peps_envs
 from peps_jax import files, results, study
 from peps_jax.config import Config
-from peps_jax.reproduce.store import CELLS, digest, settings_of
+from peps_jax.reproduce.store import CELLS, digest, read_arrays, settings_of, write_arrays
 from peps_jax.reproduce.study import Study
 from peps_jax.study import experiment, report
 from peps_jax.study.experiment import Part, Seen
@@ -50,7 +48,7 @@ def _path(part: Part, folder: Path) -> Path:
 
 
 def _digest(part: Part) -> str:
-    code = {file.name: file.read_text() for folder in CODE for file in sorted(folder.glob("*.py"))}
+    code = [files.sources(folder) for folder in CODE]
     return digest([_recipe(config) for config in part.configs], part.episodes, code)
 
 
@@ -61,15 +59,7 @@ def _recipe(config: Config) -> dict[str, Any]:
 
 
 def _leaves(part: Part, folder: Path) -> list[np.ndarray]:
-    path = _path(part, folder)
-    try:
-        with np.load(io.BytesIO(path.read_bytes())) as file:
-            arrays = dict(file)
-        found = str(arrays.pop("digest"))
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
-        raise ValueError(f"file {str(path)!r} can't be read: remove it, and it is made again") from None
-    if found != _digest(part):
-        raise ValueError(f"file {str(path)!r} was made with other settings or code: choose another folder")
+    arrays = read_arrays(_path(part, folder), _digest(part), "settings or code")
     return [arrays[str(place)] for place in range(len(arrays))]
 
 
@@ -80,9 +70,6 @@ def _make(part: Part, folder: Path) -> Seen:
         like = jax.eval_shape(lambda config: experiment.learn(config, part.episodes), part.configs[0])
         return jax.tree.unflatten(jax.tree.structure(like), _leaves(part, folder))
     seen = experiment.run_part(part)
-    buffer = io.BytesIO()
-    arrays = {str(place): leaf for place, leaf in enumerate(jax.tree.leaves(seen))}
-    np.savez_compressed(buffer, digest=np.array(_digest(part)), **arrays)
     path.parent.mkdir(parents=True, exist_ok=True)
-    files.write_whole(path, buffer.getvalue())
+    write_arrays(path, _digest(part), {str(place): leaf for place, leaf in enumerate(jax.tree.leaves(seen))})
     return seen

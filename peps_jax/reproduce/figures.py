@@ -13,7 +13,8 @@ import peps_envs
 from peps_jax import files, plots, results
 from peps_jax.reproduce.store import Record
 from peps_jax.reproduce.study import BASELINES, DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
-from peps_jax.reproduce.tables import SCORES, TITLES, Line, interval, markdown, with_interval
+from peps_jax.reproduce.tables import SCORES, TITLES, Line, interval, with_interval
+from peps_jax.results import markdown
 from peps_jax.statistics import Estimate
 
 if TYPE_CHECKING:

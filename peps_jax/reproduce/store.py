@@ -9,7 +9,6 @@ A folder holds one configuration. Another one's trainings, or those of other cod
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import io
 import json
 import zipfile
@@ -68,18 +67,36 @@ def settings_of(config: Config) -> dict[str, Any]:
 
 def digest(*parts: Any) -> str:
     """A short name for `parts`, which JSON knows."""
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+    return files.json_digest(parts)[:16]
 
 
 def code_digest() -> str:
     """A short name for the code that trains, evaluates and plans."""
-    contents = {}
-    for module, names in CODE.items():
-        root = Path(module.__file__).parent
-        for path in (root / name for name in names):
-            for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
-                contents[str(file.relative_to(root.parent))] = file.read_text()
-    return digest(contents)
+    return digest([files.sources(Path(module.__file__).parent, names) for module, names in CODE.items()])
+
+
+def write_arrays(path: Path, digest: str, arrays: Mapping[str, Any]) -> None:
+    """Keeps arrays, and the digest of what made them."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, digest=np.array(digest), **arrays)
+    files.write_whole(path, buffer.getvalue())
+
+
+def read_arrays(path: Path, digest: str, made_by: str = "settings") -> dict[str, np.ndarray]:
+    """What `write_arrays` was given.
+
+    Raises:
+      ValueError: it can't be read, or something with another digest made it: other `made_by`.
+    """
+    try:
+        with np.load(io.BytesIO(path.read_bytes())) as file:
+            arrays = dict(file)
+        found = str(arrays.pop("digest"))
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
+        raise ValueError(f"file {str(path)!r} can't be read: remove it, and it is made again") from None
+    if found != digest:
+        raise ValueError(f"file {str(path)!r} was made with other {made_by}: choose another folder")
+    return arrays
 
 
 class Store:
@@ -140,13 +157,10 @@ class Store:
 
     def save(self, name: str, recipe: Mapping[str, Any], record: Record) -> None:
         """Keeps a record."""
-        arrays = {"digest": np.array(self.digest(recipe)), "routes": record.routes, "failed": record.failed}
-        arrays["seconds"] = np.array(record.seconds)
+        arrays = {"routes": record.routes, "failed": record.failed, "seconds": np.array(record.seconds)}
         for part in ("mode", "sampled", "heat"):
             arrays |= {f"{part}/{key}": values for key, values in getattr(record, part).items()}
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **arrays)
-        files.write_whole(self._path(name), buffer.getvalue())
+        write_arrays(self._path(name), self.digest(recipe), arrays)
 
     def load(self, name: str, recipe: Mapping[str, Any]) -> Record | None:
         """The record called `name`, or None if there is none.
@@ -157,16 +171,9 @@ class Store:
         path = self._path(name)
         if not path.exists():
             return None
-        try:
-            with np.load(io.BytesIO(path.read_bytes())) as file:
-                arrays = dict(file)
-            found, routes = str(arrays["digest"]), arrays["routes"]
-            failed, seconds = bool(arrays["failed"]), float(arrays["seconds"])
-        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
-            raise ValueError(f"file {str(path)!r} can't be read: remove it, and it is made again") from None
-        if found != self.digest(recipe):
-            raise ValueError(f"file {str(path)!r} was made with other settings: choose another folder")
+        arrays = read_arrays(path, self.digest(recipe))
         part = lambda name: {
             key.partition("/")[2]: value for key, value in arrays.items() if key.startswith(f"{name}/")
         }
-        return Record(part("mode"), part("sampled"), routes, part("heat"), failed, seconds)
+        failed, seconds = bool(arrays["failed"]), float(arrays["seconds"])
+        return Record(part("mode"), part("sampled"), arrays["routes"], part("heat"), failed, seconds)

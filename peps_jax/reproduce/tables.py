@@ -18,16 +18,12 @@ from peps_jax import files, results
 from peps_jax.config import Config
 from peps_jax.reproduce.store import Record
 from peps_jax.reproduce.study import BASELINES, DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
+from peps_jax.results import markdown
 from peps_jax.statistics import Estimate, estimate, interquartile_mean, probability_of_improvement
+from peps_jax.study import report
 
 SCORES = ("return", "explicability")
-TITLES = {
-    "peps": "PEPS",
-    "sac": "SAC",
-    "drlhp": "DRLHP",
-    "policy_shaping": "policy shaping",
-    "human": "human",
-}
+TITLES = report.TITLES | {"human": "human"}
 # Gong and Zhang 2021, Table 1, in the order of `DOMAINS`: averages over 100 rollouts, without intervals
 PAPER = {
     "return": {
@@ -103,12 +99,6 @@ def with_interval(found: Estimate, digits: int = 1) -> str:
     if not math.isfinite(found.value):
         return "–"
     return f"{figure(found.value, digits)} [{figure(found.low, digits)}, {figure(found.high, digits)}]"
-
-
-def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    shown = lambda cells: "| " + " | ".join(cells) + " |"
-    return "\n".join([shown(head), "|" + "---|" * len(head), *map(shown, rows)]) + "\n"
 
 
 def latex(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -70,18 +70,24 @@ def analyse(ratings: dict[str, np.ndarray]) -> Group:
 def groups(key: Array, scenes: dict[str, Segments], config: Config, number: int = GROUPS) -> list[Group]:
     """`number` re-drawn groups of RATERS who passed the sanity check; each is shown SHOWN scenes of each method, drawn anew."""
     together = jax.tree.map(lambda *rows: jnp.stack(rows), *scenes.values())  # (methods, n, horizon, ...)
-    methods, pool = together.mask.shape[:2]
+    ratings = np.asarray(_groups(jax.random.split(key, number), together, config))
+    return [analyse(dict(zip(scenes, group.T, strict=True))) for group in ratings]
 
-    def one(key: Array) -> tuple[Array, Array]:
+
+@jax.jit
+def _groups(keys: Array, scenes: Segments, config: Config) -> Array:
+    """Mean ratings (groups, RATERS, methods) of `scenes` (methods, n, horizon, ...)."""
+    methods, pool = scenes.mask.shape[:2]
+
+    def one(key: Array) -> Array:
         key_recruit, key_check, key_show, key_rate = jax.random.split(key, 4)
         volunteers = recruit(key_recruit, 2 * RATERS)
         failed = ~attentive(key_check, volunteers)
         order = jnp.argsort(failed, stable=True)[:RATERS]
         raters = jax.tree.map(lambda rows: rows[order], volunteers)
         shown = jax.random.randint(key_show, (methods, SHOWN), 0, pool)
-        drawn = jax.tree.map(lambda rows: jax.vmap(lambda row, which: row[which])(rows, shown), together)
+        drawn = jax.tree.map(lambda rows: jax.vmap(lambda row, which: row[which])(rows, shown), scenes)
         flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), drawn)
         return rate(key_rate, raters, flat, config).reshape(RATERS, methods, SHOWN).mean(-1)
 
-    ratings = np.asarray(jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(key, number)))
-    return [analyse(dict(zip(scenes, group.T, strict=True))) for group in ratings]
+    return jax.lax.map(one, keys)

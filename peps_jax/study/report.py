@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from peps_jax import files, film
+from peps_jax.results import markdown
 from peps_jax.study.experiment import SETTINGS, Conduct, Findings
 from peps_jax.study.ratings import RATERS, Group
 from peps_jax.study.scenes import BEHAVIOURS, typical
@@ -64,11 +65,6 @@ def _behaves(found: Conduct) -> list[str]:
     return [*counted, f"{np.mean(found.crash_rate):.1%}", f"{np.mean(found.return_):.2f}{failed}"]
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    shown = lambda cells: "| " + " | ".join(cells) + " |"
-    return "\n".join([shown(head), "|" + "---|" * len(head), *map(shown, rows)])
-
-
 def text(findings: Findings) -> str:
     """What was found, in Markdown."""
     columns = {"rating": findings.groups, "rating with all shown": findings.wider}
@@ -80,15 +76,15 @@ def text(findings: Findings) -> str:
         paper = "{} ± {}".format(*PAPER[method]) if method in PAPER else ""
         rows.append([TITLES[method], *_behaves(found), *(rating(group, method) for group in rated.values()), paper])
     parts = [
-        _table(["agent", *heads, *rated, "paper's rating"], rows),
-        f"Agents by what they do in most scenes. Of the paper's agents, {_said(findings.groups, ' (paper: p = 0.037)')}",
+        markdown(["agent", *heads, *rated, "paper's rating"], rows),
+        f"Agents by what they do in most scenes. Of the paper's agents, {_said(findings.groups, ' (paper: p = 0.037)')}\n",
     ]
     if findings.wider:
-        parts.append(f"With all shown, {_said(findings.wider)}")
+        parts.append(f"With all shown, {_said(findings.wider)}\n")
     if len(findings.over_lam) > 1:
         rows = [[f"{lam:g}", *_behaves(found)] for lam, found in findings.over_lam.items()]
-        parts += [f"PEPS over λ, of which the study's is {SETTINGS['lam']:g}:", _table(["λ", *heads], rows)]
-    return "\n\n".join(parts) + "\n"
+        parts += [f"PEPS over λ, of which the study's is {SETTINGS['lam']:g}:\n", markdown(["λ", *heads], rows)]
+    return "\n".join(parts)
 
 
 def write(findings: Findings, folder: Path) -> list[Path]:
