@@ -7,7 +7,8 @@ import os
 
 # before JAX starts; nearly all of a test's time is compilation, which optimizing would only prolong
 os.environ["XLA_FLAGS"] = (
-    f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2 --xla_backend_optimization_level=0"
+    f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    " --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 )
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ["PEPS_JAX_CACHE"] = ""  # tests change code, of which what is kept knows nothing

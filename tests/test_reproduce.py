@@ -297,42 +297,41 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
 @pytest.mark.slow
 def test_a_stopped_table_continues(tmp_path, capsys, tiny, monkeypatch):
     monkeypatch.setattr(study, "PLANNER", {name: dict(points=1, resolution=13) for name in study.PLANNER})
-    domains, trained_methods = ("nav-d1",), ("peps", "sac")  # each method is a program to compile
+    monkeypatch.setattr(batch, "CELLS_PER_DEVICE", 1)  # two batches
     for module in (tables, figures):
-        monkeypatch.setattr(module, "DOMAINS", domains)
-        monkeypatch.setattr(module, "METHODS", trained_methods)
+        monkeypatch.setattr(module, "DOMAINS", ("nav-d1",))
+        monkeypatch.setattr(module, "METHODS", ("peps", "sac"))
         monkeypatch.setattr(module, "BASELINES", ("sac",))
-    compiled, methods_asked = batch.program, []
+    seeds, compiled, asked = 4, batch.program, []
+    made, kept = Study(tiny, seeds, EPISODES), Store(tmp_path, tiny, EPISODES, seeds)
+    kept.open()
+    plans = [made.planned("nav-d1", objective) for objective in ("peps", "human")]
+    for what in [*plans, *made.trainings("nav-d1", "sac")]:  # one method and one plan are enough to compile
+        kept.save(what.name, what.recipe, made_up(80.0))
 
     def interrupt_the_last(cell, *arguments):
-        methods_asked.append(cell.method)
-        if len(methods_asked) == len(trained_methods):
+        asked.append(cell.method)
+        if len(asked) == 2:
             raise KeyboardInterrupt
         return compiled(cell, *arguments)
 
     monkeypatch.setattr(batch, "program", interrupt_the_last)
-    made, kept = Study(tiny, 2, EPISODES), Store(tmp_path, tiny, EPISODES, 2)
-    kept.open()
-    for objective in ("peps", "human"):  # one plan is enough to compile
-        plan = made.planned("nav-d1", objective)
-        kept.save(plan.name, plan.recipe, made_up(80.0))
-    arguments = ["table1", "--seeds", 2, "--out", tmp_path]
+    arguments = ["table1", "--seeds", seeds, "--out", tmp_path]
     assert call(arguments, tiny) == 130
     assert "the same command continues" in capsys.readouterr().err
     kept = {path: path.stat().st_mtime_ns for path in (tmp_path / store.CELLS).iterdir()}
-    assert len(kept) == len(domains) * (3 + 2), "plans, and one method's trainings"
+    assert len(kept) == 3 + seeds + 2, "plans, SAC, and a batch of PEPS"
     assert not (tmp_path / "table1.md").exists()
 
     assert call(arguments, tiny) == 0
-    assert methods_asked == [*trained_methods, trained_methods[-1]]
+    assert asked == ["peps"] * 3
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    lines = lines_of(tmp_path / "table1.csv")
-    trained = [line for line in lines if line["method"] in trained_methods]
-    assert all(np.isfinite(float(line["explicability_low"])) for line in trained)
-    assert all(np.isfinite(float(line["sampled_return"])) for line in trained)
+    trained = next(line for line in lines_of(tmp_path / "table1.csv") if line["method"] == "peps")
+    assert trained["seeds"] == "4"
+    assert np.isfinite([float(trained[name]) for name in ("explicability_low", "sampled_return")]).all()
 
     assert call(["figure1", *arguments], tiny) == 0
-    assert len(methods_asked) == len(trained_methods) + 1, "nothing is left to train"
+    assert len(asked) == 3, "nothing is left to train"
     columns = ("x", "y", "learned", "true")
     heat = np.array([[float(line[name]) for name in columns] for line in lines_of(tmp_path / "figure1.csv")])
     assert np.isfinite(heat).all()

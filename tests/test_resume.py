@@ -20,6 +20,9 @@ import peps_envs
 from peps_jax import batch, checkpoint, files, ledger, plots, programs, results, sweep
 from peps_jax.train import init
 
+# a real death takes the threads of Orbax with it; here they come back to a loop that is no more
+pytestmark = pytest.mark.filterwarnings("ignore:(?s).*Event loop is closed:pytest.PytestUnraisableExceptionWarning")
+
 PREFIX = "python -m peps_jax.sweep: error: "
 SIZES = [
     *("--num-envs", "4", "--rollout-length", "10", "--warmup-steps", "40", "--batch-size", "16"),
