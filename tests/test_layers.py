@@ -1,6 +1,7 @@
 """Who may import whom. A module that is added to the source has to be given a place here."""
 
 import ast
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -180,3 +181,20 @@ def test_importing_the_library_imports_neither_brax_nor_matplotlib():
     program = "import sys, peps_envs, peps_jax; print(*({'brax', 'matplotlib'} & set(sys.modules)))"
     printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert not printed.split()
+
+
+@pytest.mark.parametrize("command", ["sweep", "reproduce", "study"])
+def test_a_command_has_a_device_for_every_core(command):
+    """Importing it makes no array: JAX would meet its devices before they are as many as the cores."""
+    program = f"""
+import os
+os.sched_getaffinity = lambda process: range(3)
+import peps_jax.{command} as command, peps_jax.command_line, jax
+if hasattr(command, "__path__"):
+    import peps_jax.{command}.__main__
+peps_jax.command_line.use_every_core()
+print(jax.device_count())
+"""
+    environment = {**os.environ, "XLA_FLAGS": ""}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.split() == ["3"]

@@ -13,14 +13,14 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-import peps_envs
+from peps_envs.highway import Highway
 from peps_envs.highway.vehicle import LANE_LEFT, SLOWER
 from peps_jax import rollout
 from peps_jax.parts.trajectory import Preferences, Segments
 from peps_jax.study.participants import answers, attentive, recruit
 from peps_jax.study.scenes import DRY, HORIZON, crashed, road, whole
 
-NUM_ACTIONS = peps_envs.make(DRY).environment.action_space.size
+NUM_ACTIONS = Highway.action_space.size
 TRAINERS, ANSWERS = 15, 200  # participants who compare, and how many pairs each of them
 PURPOSEFUL = 0.8  # share of drivers who wait, most of them braking, and then change lane; the others act at random
 BRAKING = 0.5  # share of those who brake meanwhile; the others hold any action, which tells late from slow lane changes

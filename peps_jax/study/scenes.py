@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 import peps_envs
+from peps_envs.highway import Highway
 from peps_envs.highway.vehicle import LANE_WIDTH
 from peps_jax import rollout
 from peps_jax.config import Config
@@ -18,7 +19,7 @@ from peps_jax.parts.trajectory import Segments, Trajectory
 from peps_jax.train import Result
 
 DRY, RAIN = "highway-dry", "highway-rain"
-HORIZON = peps_envs.make(RAIN).environment.horizon
+HORIZON = Highway.horizon
 ONSET = (0.0, 0.4)  # s, when the car in front begins to brake: nobody can count on it and brake before
 
 BEHAVIOURS = ("steers at once", "brakes, then steers", "brakes and stays", "neither")
