@@ -12,7 +12,7 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PAGES = (ROOT / "README.md", ROOT / "docs" / "cluster.md")
+PAGES = (ROOT / "README.md", ROOT / "docs" / "cluster.md", ROOT / "docs" / "ablations.md")
 
 
 def embedded(text: str) -> str:

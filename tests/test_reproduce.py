@@ -265,6 +265,11 @@ def test_the_papers_numbers_say_what_the_paper_says():
         assert all(explicability[method] <= returns[method] for method in returns), "l_H - l_A costs on average"
 
 
+def test_points_at_one_place_share_a_label():
+    places = np.array([[0.1, 0.1], [0.5, 0.1], [0.13, 0.08], [0.1, 0.5]])
+    assert figures._at_one_place(places) == [[0, 2], [1], [3]]
+
+
 # --- the whole ------------------------------------------------------------------------------------------------------------
 
 

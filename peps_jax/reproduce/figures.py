@@ -223,13 +223,27 @@ def _frontier_panel(axes: Axes, points: Sequence[Line]) -> None:
         if method == "peps":
             places = np.array([[point[score] for score in SCORES] for point in visible]).reshape(-1, 2)
             axes.plot(*places.T, color=plots.colour_of(method), linewidth=1.0, alpha=0.6, zorder=2)
-            for point, place in zip(visible, places, strict=True):
-                _note(axes, f"{point['lam']:g}", place)
+            sizes = [high - low for low, high in limits.values()]
+            for together in _at_one_place(places / sizes):
+                told = ", ".join(f"{visible[number]['lam']:g}" for number in together)
+                _note(axes, told, places[together[0]])
     for number, point in enumerate(hidden):
         lam = f" λ = {point['lam']:g}" if point["lam"] is not None else ""
         text = f"↙ {TITLES[point['method']]}{lam} ({point['return']:.0f}, {point['explicability']:.0f})"
         colour = plots.colour_of(point["method"])
         axes.text(0.03, 0.03 + 0.07 * number, text, transform=axes.transAxes, fontsize=7, color=colour)
+
+
+def _at_one_place(places: np.ndarray) -> list[list[int]]:
+    """Rows of `places` (n, 2), in shares of the axes, that can't be told apart: each with the first one that it is near to."""
+    groups: list[list[int]] = []
+    for number, place in enumerate(places):
+        near = [group for group in groups if np.abs(place - places[group[0]]).max() < 0.06]
+        if near:
+            near[0].append(number)
+        else:
+            groups.append([number])
+    return groups
 
 
 def _note(axes: Axes, text: str, place: Any) -> None:
