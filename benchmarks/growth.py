@@ -17,7 +17,7 @@ from training import seeds_of, shortened, steps_of
 
 from peps_jax import Config, batch, train
 
-ROUNDS = 16
+ROUNDS = 8
 MOST = 8  # cells in a program: a sweep of many keeps what it has, batch by batch
 LARGEST = 64
 
