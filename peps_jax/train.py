@@ -132,20 +132,21 @@ def improve(
     method = methods.get(config.method)
     key_batch, key_update = jax.random.split(key)
     filled = (index + 1) * config.steps_per_round
-    batches = replay.sample(state.replay, key_batch, (config.updates_per_round, config.batch_size), filled)
+    shape = (config.updates_per_round, config.batch_size)
+    batches = replay.sample(state.replay, key_batch, shape, filled)
     temperature = (annealed_temperature(index, config) + method.entropy_weight(config)) * config.reward_scale
 
     slower = config.replace(learning_rate=faded_learning_rate(index, config))
 
-    def update(agent: sac.Agent, step: tuple[Transition, Array]) -> tuple[sac.Agent, dict[str, Array]]:
-        batch, key = step
-        return sac.update(agent, batch, temperature, key, slower)
+    def update(agent: sac.Agent, step: tuple[Transition, sac.Noise]) -> tuple[sac.Agent, dict[str, Array]]:
+        batch, noise = step
+        return sac.update(agent, batch, temperature, noise, slower)
 
     agents, infos = [], []
     for agent, reward, key in zip(state.agents, method.rewards, _keys(key_update, len(method.rewards)), strict=True):
         # before the updates: what the method knows doesn't change within a round
         valued = batches._replace(reward=value(reward, state.knowledge, batches, config) * config.reward_scale)
-        agent, info = jax.lax.scan(update, agent, (valued, jax.random.split(key, config.updates_per_round)))
+        agent, info = jax.lax.scan(update, agent, (valued, sac.draw_noise(key, shape, config)))
         agents.append(agent)
         infos.append(info)
     return tuple(agents), jax.tree.map(lambda *values: jnp.mean(jnp.stack(values)), *infos)

@@ -34,8 +34,24 @@ def test_continuous_log_ratio_is_relative_to_the_uniform_policy():
     density = np.exp(np.asarray(ratio, np.float64)) / 2
     np.testing.assert_allclose(np.trapezoid(density, actions[:, 0]), 1.0, atol=5e-3)
     assert np.trapezoid(density * np.asarray(ratio), actions[:, 0]) > 0
-    action, sampled = head.sample(outputs, jax.random.key(0))
+    action, sampled = head.sample(outputs, head.noise(jax.random.key(0), ()))
     np.testing.assert_allclose(sampled, head.log_ratio(outputs, action), rtol=1e-3)
+
+
+def test_samples_follow_the_policy():
+    keys, number = jax.random.key(0), (40_000,)
+    head = sac.continuous_head(1, 1)
+    outputs = jnp.array([0.4, 0.2])
+    action, ratio = head.sample(jnp.broadcast_to(outputs, (*number, 2)), head.noise(keys, number))
+    places = np.linspace(-0.9999, 0.9999, 20_001)
+    log_ratio = np.asarray(jax.jit(jax.vmap(head.log_ratio, in_axes=(None, 0)))(outputs, jnp.asarray(places)[:, None]))
+    density = np.exp(log_ratio) / 2
+    np.testing.assert_allclose(action.mean(), np.trapezoid(density * places, places), atol=0.02)
+    np.testing.assert_allclose(ratio.mean(), np.trapezoid(density * log_ratio, places), atol=0.02)
+    head = sac.discrete_head(1, 3)
+    outputs = jnp.array([0.2, -1.0, 0.7])
+    action, _ = head.sample(jnp.broadcast_to(outputs, (*number, 3)), head.noise(keys, number))
+    np.testing.assert_allclose(np.bincount(action) / number, jax.nn.softmax(outputs), atol=0.01)
 
 
 def test_discrete_log_ratio_is_0_for_the_uniform_policy():
@@ -67,7 +83,7 @@ def test_discrete_expectations_are_exact(line):
     head, _, critic_network = sac.networks(config)
     agent = sac.init(jax.random.key(0), config)
     observation, outputs = jnp.array([0.3]), jnp.array([0.2, -1.0, 0.7])
-    value, ratio = head.expect(outputs, jax.random.key(1), critic_network, agent.critics, observation)
+    value, ratio = head.expect(outputs, head.noise(jax.random.key(1), ()), critic_network, agent.critics, observation)
     probabilities = np.exp(outputs) / np.exp(outputs).sum()
     by_action = [head.critics(critic_network, agent.critics, observation, jnp.asarray(action)) for action in range(3)]
     # the same minimum for an action at a time, weighed by hand
@@ -88,10 +104,11 @@ def test_critic_targets_by_hand(line):
     # targets that always say 7 and 5: the smaller counts
     targets = jax.tree.map(jnp.zeros_like, agent.targets)
     targets["params"]["Dense_1"]["bias"] = jnp.array([[7.0], [5.0]])
-    agent, batch, key, temperature = agent.replace(targets=targets), two_transitions(), jax.random.key(1), 0.3
+    agent, batch, temperature = agent.replace(targets=targets), two_transitions(), 0.3
     head, policy_network, _ = sac.networks(config)
-    _, ratio = head.sample(policy_network.apply(agent.policy, batch.next_observation), key)
-    found = sac.critic_targets(agent, batch, temperature, key, config)
+    noise = head.noise(jax.random.key(1), (2,))
+    _, ratio = head.sample(policy_network.apply(agent.policy, batch.next_observation), noise)
+    found = sac.critic_targets(agent, batch, temperature, noise, config)
     np.testing.assert_allclose(found, [3.0, 3.0 + 0.9 * (5.0 - temperature * ratio[1])], rtol=1e-5)
 
 
@@ -110,7 +127,8 @@ def test_policy_loss_by_hand(line):
     critics["params"]["Dense_1"]["bias"] = jnp.array([[1.0, 2.0, 3.0], [3.0, 2.0, 1.0]])
     uniform = jax.tree.map(jnp.zeros_like, agent.policy)
     batch = two_transitions()._replace(action=jnp.zeros(2, jnp.int32))
-    loss, entropy = sac.policy_loss(uniform, critics, batch, 0.3, jax.random.key(1), config)
+    noise = sac.draw_noise(jax.random.key(1), (2,), config).policy
+    loss, entropy = sac.policy_loss(uniform, critics, batch, 0.3, noise, config)
     np.testing.assert_allclose(entropy, 0.0, atol=1e-6)
     np.testing.assert_allclose(loss, -(1 + 2 + 1) / 3, rtol=1e-6)
 
@@ -118,7 +136,9 @@ def test_policy_loss_by_hand(line):
 def test_targets_follow_slowly(line):
     config = line.replace(target_rate=0.1)
     agent = sac.init(jax.random.key(0), config)
-    after, _ = jax.jit(sac.update)(agent, two_transitions(), 0.3, jax.random.key(1), config)
+    after, _ = jax.jit(sac.update)(
+        agent, two_transitions(), 0.3, sac.draw_noise(jax.random.key(1), (2,), config), config
+    )
     expected = jax.tree.map(lambda old, new: 0.9 * old + 0.1 * new, agent.targets, after.critics)
     jax.tree.map(lambda one, two: np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-6), after.targets, expected)
     np.testing.assert_array_equal(after.log_temperature, agent.log_temperature)
@@ -135,7 +155,8 @@ def test_temperature_rises_where_the_entropy_is_too_low(line, excess):
 def test_tuned_temperature_is_used(line):
     config = line.replace(tune_temperature=True, temperature=0.3, reward_scale=0.5)
     agent = sac.init(jax.random.key(0), config)
-    after, info = jax.jit(sac.update)(agent, two_transitions(), 99.0, jax.random.key(1), config)
+    noise = sac.draw_noise(jax.random.key(1), (2,), config)
+    after, info = jax.jit(sac.update)(agent, two_transitions(), 99.0, noise, config)
     np.testing.assert_allclose(info["temperature"], 0.15, rtol=1e-5)
     assert float(after.log_temperature) != float(agent.log_temperature)
 

@@ -112,7 +112,7 @@ def test_the_metric_is_the_divergence_of_eq_3():
 
     head = sac.discrete_head(1, ACTIONS)
     table = jnp.asarray(logits, jnp.float32)
-    act = lambda observation, key: head.sample(table[observation[0].astype(jnp.int32)], key)
+    act = lambda observation, key: head.sample(table[observation[0].astype(jnp.int32)], head.noise(key, ()))
     roll = lambda key: evaluate_policy(act, Chain(), params, belief, key, 40_000, stochastic=True)
     episodes = jax.jit(roll)(jax.random.key(0))
     # l_pi is relative to the uniform policy: log pi = l_pi - log ACTIONS
