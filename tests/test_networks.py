@@ -16,8 +16,10 @@ def differentiated(layers, rows):
     return rows @ layers[-1].kernel + layers[-1].bias[None]
 
 
-# no hidden layer, a first layer that is computed again or not, several after it, few and many outputs
-@pytest.mark.parametrize("sizes", [(3, 2), (3, 16, 1), (3, 16, 16, 4), (9, 16, 16, 12), (3, 16, 8, 20, 12)])
+# no hidden layer, narrow ones; wide ones: a first that is computed again or not, several after it, few and many outputs
+@pytest.mark.parametrize(
+    "sizes", [(3, 2), (3, 16, 8, 1), (9, 40, 1), (3, 40, 40, 4), (12, 40, 40, 12), (3, 40, 8, 20, 12)]
+)
 @pytest.mark.parametrize("members", [None, 3])
 def test_gradient_is_that_of_jax(sizes, members):
     network = networks.MLP(sizes[1:-1], sizes[-1])
@@ -44,8 +46,9 @@ def test_gradient_is_that_of_jax(sizes, members):
     jax.tree.map(lambda one, other: np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5), found, expected)
 
 
-def test_one_observation_is_a_row_of_many():
-    network = networks.MLP((8, 8), 2)
+@pytest.mark.parametrize("units", [8, 40])
+def test_one_observation_is_a_row_of_many(units):
+    network = networks.MLP((units, units), 2)
     rows = jax.random.normal(jax.random.key(0), (4, 3))
     params = network.init(jax.random.key(1), rows[0])
     many = network.apply(params, rows)
