@@ -31,8 +31,7 @@ class MLP(nn.Module):
             Weights(*size, init, name=f"Dense_{place}")()
             for place, (size, init) in enumerate(zip(sizes, inits, strict=True))
         )
-        over = in_columns if max(self.hidden_sizes, default=0) <= NARROW_UNITS else in_rows
-        outputs = over(layers, features.reshape(-1, features.shape[-1]))
+        outputs = quicker(self.hidden_sizes)(layers, features.reshape(-1, features.shape[-1]))
         return outputs.reshape(*features.shape[:-1], self.output_size)
 
 
@@ -71,6 +70,11 @@ NARROW_OUTPUTS = 8  # outputs at most for which a product with g^T, transposed a
 FEWER = 4  # times as many units as features, from which on the first layer is cheaper computed again than transposed
 
 _kept = jax.lax.optimization_barrier
+
+
+def quicker(hidden_sizes: tuple[int, ...]) -> Callable[[tuple[Layer, ...], Array], Array]:
+    """Of `in_columns` and `in_rows`, which are one function."""
+    return in_columns if max(hidden_sizes, default=0) <= NARROW_UNITS else in_rows
 
 
 def in_columns(layers: tuple[Layer, ...], rows: Array) -> Array:
