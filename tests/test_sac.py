@@ -39,10 +39,10 @@ def test_continuous_log_ratio_is_relative_to_the_uniform_policy():
 
 
 def test_samples_follow_the_policy():
-    keys, number = jax.random.key(0), (40_000,)
+    key, shape = jax.random.key(0), (40_000,)
     head = sac.continuous_head(1, 1)
     outputs = jnp.array([0.4, 0.2])
-    action, ratio = head.sample(jnp.broadcast_to(outputs, (*number, 2)), head.noise(keys, number))
+    action, ratio = head.sample(jnp.broadcast_to(outputs, (*shape, 2)), head.noise(key, shape))
     places = np.linspace(-0.9999, 0.9999, 20_001)
     log_ratio = np.asarray(jax.jit(jax.vmap(head.log_ratio, in_axes=(None, 0)))(outputs, jnp.asarray(places)[:, None]))
     density = np.exp(log_ratio) / 2
@@ -50,8 +50,8 @@ def test_samples_follow_the_policy():
     np.testing.assert_allclose(ratio.mean(), np.trapezoid(density * log_ratio, places), atol=0.02)
     head = sac.discrete_head(1, 3)
     outputs = jnp.array([0.2, -1.0, 0.7])
-    action, _ = head.sample(jnp.broadcast_to(outputs, (*number, 3)), head.noise(keys, number))
-    np.testing.assert_allclose(np.bincount(action) / number, jax.nn.softmax(outputs), atol=0.01)
+    action, _ = head.sample(jnp.broadcast_to(outputs, (*shape, 3)), head.noise(key, shape))
+    np.testing.assert_allclose(np.bincount(action) / shape, jax.nn.softmax(outputs), atol=0.01)
 
 
 def test_discrete_log_ratio_is_0_for_the_uniform_policy():

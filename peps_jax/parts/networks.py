@@ -89,14 +89,6 @@ def _applied(layer: Layer, rows: Array) -> Array:
     return rows @ layer.kernel + layer.bias[None]
 
 
-def _activations(layers: tuple[Layer, ...], rows: Array) -> list[Array]:
-    """What every layer is given."""
-    given = [rows]
-    for layer in layers[:-1]:
-        given.append(nn.relu(_applied(layer, given[-1])))
-    return given
-
-
 @jax.custom_vjp
 def in_rows(layers: tuple[Layer, ...], rows: Array) -> Array:
     """As `in_columns`."""
@@ -104,7 +96,9 @@ def in_rows(layers: tuple[Layer, ...], rows: Array) -> Array:
 
 
 def _forward(layers: tuple[Layer, ...], rows: Array) -> tuple[Array, tuple[tuple[Layer, ...], list[Array]]]:
-    given = _activations(layers, rows)
+    given = [rows]  # what every layer is given
+    for layer in layers[:-1]:
+        given.append(nn.relu(_applied(layer, given[-1])))
     return _applied(layers[-1], given[-1]), (layers, given)
 
 
