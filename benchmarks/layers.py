@@ -1,4 +1,4 @@
-"""The ways in which a network's products can lie in memory, on all devices at once: why `peps_jax.parts.networks` has two."""
+"""The ways in which a network's products can lie in memory, on all devices at once: why `peps_jax.learning.networks` has two."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 import timing
 
 from peps_jax import Config
-from peps_jax.parts import networks
+from peps_jax.learning import networks
 
 Network = Callable[[tuple[networks.Layer, ...], jax.Array], jax.Array]
 

@@ -232,7 +232,7 @@ def _growth(record: Record) -> list[str]:
     compilation = growth["compilation"]
     lines.append(
         f"A sweep's compilation in a fresh process: {compilation['cold']:.1f} s; {compilation['warm']:.1f} s once its structure "
-        "is known, for programs are kept (`peps_jax/programs.py`)."
+        "is known, for programs are kept (`peps_jax/execution/compilation_cache.py`)."
     )
     return lines
 

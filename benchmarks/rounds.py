@@ -10,11 +10,13 @@ import jax.numpy as jnp
 import timing
 from training import WIDTHS, seeds_of, shortened
 
-from peps_jax import Config, batch, methods, rollout
-from peps_jax.methods import feedback, peps
-from peps_jax.parts import dynamics, human, replay, sac
-from peps_jax.parts.trajectory import Preferences, Trajectory, Transition
+from peps_jax import Config, methods, rollout
+from peps_jax.execution import batches
+from peps_jax.learning import dynamics, replay, sac
+from peps_jax.methods import peps, preference_based
+from peps_jax.preferences import synthetic_human
 from peps_jax.train import TrainingState, collect_and_ask, improve, init, run_round, run_rounds, value
+from peps_jax.trajectory import Preferences, Trajectory, Transition
 
 PARTS = {  # as the text calls them
     "collect": "collecting",
@@ -34,7 +36,7 @@ def prepare(config: Config) -> tuple[TrainingState, Trajectory, Preferences | No
     act = lambda observation, key, time: sac.act(state.agents, observation, key, config)[0]
     _, trajectory, _ = rollout.collect(state.actors, act, key, config)
     queries = methods.get(config.method).ask(state.knowledge, trajectory, key, config)
-    preferences = None if queries is None else human.SYNTHETIC.answer(key, queries, config)
+    preferences = None if queries is None else synthetic_human.SYNTHETIC.answer(key, queries, config)
     shape = (config.updates_per_round, config.batch_size)
     return state, trajectory, preferences, replay.sample(state.replay, key, shape, index * config.steps_per_round)
 
@@ -50,13 +52,15 @@ def parts(structure: Config) -> dict[str, Callable[..., Any]]:
 
     def ask(state, trajectory, preferences, batches, config):
         queries = methods.get(config.method).ask(state.knowledge, trajectory, key, config)
-        return human.SYNTHETIC.answer(key, queries, config)
+        return synthetic_human.SYNTHETIC.answer(key, queries, config)
 
     def fit_dynamics(state, trajectory, preferences, batches, config):
         return dynamics.fit(state.knowledge.dynamics, state.replay, filled, key, config)
 
     def fit_surrogate(state, trajectory, preferences, batches, config):
-        return feedback.learn(state.knowledge.surrogate, state.replay, filled, preferences, index, (key, key), config)
+        return preference_based.learn(
+            state.knowledge.surrogate, state.replay, filled, preferences, index, (key, key), config
+        )
 
     def value_parts(state, trajectory, preferences, batches, config):
         return value(peps.reward, state.knowledge, batches, config)
@@ -83,7 +87,7 @@ def parts(structure: Config) -> dict[str, Callable[..., Any]]:
 def seconds_of_parts(config: Config, repeats: int) -> dict[str, float]:
     """Seconds of each part of one cell's round, while all devices do the same."""
     each = 4  # cells on a device, so that what a call costs is little of it
-    cells = timing.spread(batch.stack(seeds_of(config, each * jax.device_count())))
+    cells = timing.spread(batches.stack(seeds_of(config, each * jax.device_count())))
     prepared = timing.compiled(prepare, cells)[0](cells)
     taken = {}
     for name, part in parts(config).items():

@@ -22,11 +22,13 @@ from scipy import stats
 
 import peps_envs
 from peps_envs.navigation import NavigationState
-from peps_jax import Config, evaluate, planner
-from peps_jax.batch import compile_over_devices
+from peps_jax import Config, evaluate
+from peps_jax.analysis import navigation_planner
+from peps_jax.analysis.intervals import estimate, mean
 from peps_jax.command_line import use_every_core
-from peps_jax.parts import human, surrogate
-from peps_jax.statistics import estimate, mean
+from peps_jax.execution.batches import compile_over_devices
+from peps_jax.learning import surrogate
+from peps_jax.preferences import synthetic_human
 from peps_jax.train import finish, init, run_rounds
 
 DOMAINS = ("nav-d1", "nav-d2", "nav-d3", "nav-d4")
@@ -76,7 +78,7 @@ def measure(config: Config) -> dict[str, jax.Array]:
         environment, params, belief = config.task()
         rows = jax.tree.map(lambda values: values[:: max(1, values.shape[0] // 3000)], state.replay)
         place = lambda observation: NavigationState(environment.perceive_observation(observation, params), jnp.int32(0))
-        felt = jax.vmap(lambda row: sum(human.log_weight(
+        felt = jax.vmap(lambda row: sum(synthetic_human.log_weight(
             environment, belief, place(row.observation), row.action, place(row.next_observation))))(rows)  # fmt: skip
         figures["felt"] = felt
         figures["predicted"] = surrogate.predict(result.knowledge.surrogate, rows.observation, rows.action, config)
@@ -92,7 +94,7 @@ def run_cells(configs: list[Config]) -> dict[str, np.ndarray]:
     return figures
 
 
-planned_episodes = jax.jit(planner.walk, static_argnames=("environment", "objective", "num_episodes"))
+planned_episodes = jax.jit(navigation_planner.walk, static_argnames=("environment", "objective", "num_episodes"))
 
 
 def bound(domain: str, lam: float, objective: str) -> tuple[float, float, str]:

@@ -39,7 +39,9 @@ class Config:
 
     env: Any = _static("nav-d1", "the world", group="task")
     method: str = _static(
-        "peps", "what is learned, and from which reward: peps, sac, drlhp, policy_shaping or human", group="task"
+        "peps",
+        "what is learned, and from which reward: peps, sac, drlhp, policy_shaping or human_expectation",
+        group="task",
     )
     seed: Any = _traced(0, "random seed", group="task")
     params: Any = _traced(None, "true parameters of the world (default: the task's)", group="task", flag=False)

@@ -78,7 +78,7 @@ def evaluate(
 
     Args:
       result: of `train`.
-      config: world, method, belief and seed to evaluate in; usually the training's. "human" acts in the believed world.
+      config: world, method, belief and seed to evaluate in; usually the training's. "human_expectation" acts in the believed world.
       num_episodes: how many.
       stochastic: act by samples instead of the policy's mode.
       key: random key; by default one that follows from `config.seed` and differs from the training's.

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import Array
 
 import peps_envs
-from peps_jax.parts import human
+from peps_jax.preferences import synthetic_human
 
 
 class Score(NamedTuple):
@@ -43,7 +43,7 @@ def score(
     environment: peps_envs.Environment, params: Any, belief: Any, state: Any, action: Array, next_state: Any
 ) -> Score:
     """The score of one transition; every field is ()."""
-    log_belief, human_reward = human.log_weight(environment, belief, state, action, next_state)
+    log_belief, human_reward = synthetic_human.log_weight(environment, belief, state, action, next_state)
     expected = environment.next_state_distribution(state, action, params)
     return Score(
         return_=environment.reward(state, action, next_state, params),

@@ -13,7 +13,7 @@ from jax import Array
 from peps_jax import explicability, methods
 from peps_jax.config import Config
 from peps_jax.explicability import Score
-from peps_jax.parts.trajectory import Trajectory, Transition
+from peps_jax.trajectory import Trajectory, Transition
 
 
 class Running(NamedTuple):

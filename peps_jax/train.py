@@ -17,8 +17,9 @@ from jax import Array
 
 from peps_jax import methods, rollout
 from peps_jax.config import Config
-from peps_jax.parts import human, replay, sac
-from peps_jax.parts.trajectory import Preferences, Segments, Transition
+from peps_jax.learning import replay, sac
+from peps_jax.preferences import synthetic_human
+from peps_jax.trajectory import Preferences, Segments, Transition
 
 # Minibatches whose rewards are computed at once. All of a round's took two to three times as long on a CPU: what the ensembles'
 # layers put out didn't stay in the cache.
@@ -176,7 +177,7 @@ def faded_learning_rate(index: Array, config: Config) -> Array:
 
 
 def run_round(
-    state: TrainingState, index: Array, config: Config, teacher: human.Teacher = human.SYNTHETIC
+    state: TrainingState, index: Array, config: Config, teacher: synthetic_human.Teacher = synthetic_human.SYNTHETIC
 ) -> tuple[TrainingState, dict[str, Array]]:
     """Round `index` with a teacher that answers inside the program; returns the state and the round's figures."""
     state, queries, collected = collect_and_ask(state, index, config)
@@ -187,13 +188,13 @@ def run_round(
 
 
 def run_rounds(
-    state: TrainingState, indices: Array, config: Config, teacher: human.Teacher = human.SYNTHETIC
+    state: TrainingState, indices: Array, config: Config, teacher: synthetic_human.Teacher = synthetic_human.SYNTHETIC
 ) -> tuple[TrainingState, dict[str, Array]]:
     """Rounds `indices` (n,) one after the other: the state after them, and curves (n,)."""
     return jax.lax.scan(lambda state, index: run_round(state, index, config, teacher), state, indices)
 
 
-def train(config: Config, teacher: human.Teacher = human.SYNTHETIC) -> Result:
+def train(config: Config, teacher: synthetic_human.Teacher = synthetic_human.SYNTHETIC) -> Result:
     """A whole training. Pure: works under `jax.jit`, `jax.vmap` (over any traced leaves of `config`) and in a scan.
 
     Raises:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from peps_jax import results
+from peps_jax.sweep import results
 
 
 def exit_code(main: Callable[..., int], *arguments: object) -> int:

@@ -14,7 +14,7 @@ with warnings.catch_warnings():  # a library that Brax imports announces its ret
     warnings.filterwarnings("ignore", "JAXopt is no longer maintained", DeprecationWarning)
     from brax.envs.wrappers import training
 
-    from peps_envs.brax_bridge import BraxEnvironment
+    from peps_envs.bridges.to_brax import BraxEnvironment
 
 EAST, STILL = jnp.array([1.0, 0.0]), jnp.zeros(2)
 TASK = peps_envs.make("nav-d1")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from conftest import LineParams
 
-from peps_jax.parts import dynamics
-from peps_jax.parts.trajectory import Transition
+from peps_jax.learning import dynamics
+from peps_jax.trajectory import Transition
 
 NUMBER = 2000
 WIDTH = 0.1

@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import peps_envs
-from peps_envs import highway, interface
+from peps_envs import highway
+from peps_envs.environment import event
 from peps_envs.highway import collision, environment, simulation, traffic, vehicle
 from peps_envs.highway.vehicle import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER, Control
 
@@ -210,7 +211,7 @@ def episodes(keys, plan, params):
 
         start = (WORLD.reset(key_reset, params)[0], jnp.ones((), bool))
         _, (steps, alive) = jax.lax.scan(step, start, (plan, jax.random.split(key_steps, len(plan))))
-        crashed = interface.event(WORLD, steps.events, "crashed")
+        crashed = event(WORLD, steps.events, "crashed")
         return jnp.sum(steps.reward * alive), jnp.any(crashed & alive), steps
 
     return jax.vmap(episode)(keys)
@@ -266,12 +267,12 @@ def test_an_episode_ends_in_one_way_only(seed, plan, name):
     for leaf in jax.tree.leaves((steps.observation, steps.reward, steps.state.vehicles)):
         assert np.all(np.isfinite(leaf))
     assert not np.any(steps.truncated)
-    wrecked = interface.event(WORLD, steps.events, "crashed")
+    wrecked = event(WORLD, steps.events, "crashed")
     np.testing.assert_array_equal(steps.terminated, wrecked | (np.arange(8) >= 7)[None])
     assert bool(crashed[0]) == bool(wrecked.any())
     if not crashed[0]:
         assert np.all((steps.reward >= 0) & (steps.reward <= 1))
-    sideways = np.asarray(interface.event(WORLD, steps.events, "changed_lane")).sum()
+    sideways = np.asarray(event(WORLD, steps.events, "changed_lane")).sum()
     assert sideways == 0 or {LANE_LEFT, LANE_RIGHT} & set(plan.tolist())
 
 

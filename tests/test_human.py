@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from conftest import Point
 
-from peps_jax.parts import human
-from peps_jax.parts.trajectory import Segments
+from peps_jax.preferences import synthetic_human
+from peps_jax.trajectory import Segments
 
 REPEATS = 4000
 
@@ -30,24 +30,26 @@ def weight(place, params):
 def share_of_first(config, segments, key=0):
     """How often the first segment is preferred, of many answers to one query."""
     many = jax.tree.map(lambda rows: jnp.repeat(rows, REPEATS, 0), segments)
-    return jax.jit(human.answer)(jax.random.key(key), many, config)
+    return jax.jit(synthetic_human.answer)(jax.random.key(key), many, config)
 
 
 def test_log_weight_is_belief_and_reward(line):
     environment, _, belief = line.task()
-    parts = human.log_weight(environment, belief, Point(jnp.zeros(1), 0), jnp.zeros(1), Point(jnp.full(1, 0.2), 1))
+    parts = synthetic_human.log_weight(
+        environment, belief, Point(jnp.zeros(1), 0), jnp.zeros(1), Point(jnp.full(1, 0.2), 1)
+    )
     np.testing.assert_allclose(sum(parts), weight(0.2, belief), rtol=1e-5)
 
 
 def test_segment_values_sum_up_to_the_mask(line):
-    values = human.segment_values(query([0.1, 0.2, 9.0], [0.3, 0.0, 0.1], [[1, 1, 0], [1, 1, 1]]), line)
+    values = synthetic_human.segment_values(query([0.1, 0.2, 9.0], [0.3, 0.0, 0.1], [[1, 1, 0], [1, 1, 1]]), line)
     expected = [sum(weight(place, line.belief) for place in places) for places in ([0.1, 0.2], [0.3, 0.0, 0.1])]
     np.testing.assert_allclose(values[0], expected, rtol=1e-5)
 
 
 def test_myopia_weighs_the_end(line):
     segments = query([0.1, 0.2, 9.0], [0.3, 0.0, 0.1], [[1, 1, 0], [1, 1, 1]])
-    values = human.segment_values(segments, line.replace(myopia=0.5))
+    values = synthetic_human.segment_values(segments, line.replace(myopia=0.5))
     first = 0.5 * weight(0.1, line.belief) + weight(0.2, line.belief)
     second = 0.25 * weight(0.3, line.belief) + 0.5 * weight(0.0, line.belief) + weight(0.1, line.belief)
     np.testing.assert_allclose(values[0], [first, second], rtol=1e-5)
@@ -57,7 +59,7 @@ def test_myopia_weighs_the_end(line):
 def test_answers_follow_eq_2(line, rationality, mistake_rate):
     config = line.replace(rationality=rationality, mistake_rate=mistake_rate)
     segments = query([0.0, 0.1], [0.2, 0.1])
-    difference = float(np.subtract(*human.segment_values(segments, config)[0]))
+    difference = float(np.subtract(*synthetic_human.segment_values(segments, config)[0]))
     right = 1 / (1 + np.exp(-rationality * difference))
     probability = right * (1 - mistake_rate) + (1 - right) * mistake_rate
     preferences = share_of_first(config, segments)
@@ -69,17 +71,17 @@ def test_answers_follow_eq_2(line, rationality, mistake_rate):
 
 def test_indifference_is_a_tie(line):
     segments = query([0.0, 0.1], [0.2, 0.1])
-    difference = abs(float(np.subtract(*human.segment_values(segments, line)[0])))
+    difference = abs(float(np.subtract(*synthetic_human.segment_values(segments, line)[0])))
     assert bool(jnp.all(share_of_first(line.replace(indifference=1.01 * difference), segments).answers == 0.5))
     assert not bool(jnp.any(share_of_first(line.replace(indifference=0.99 * difference), segments).answers == 0.5))
 
 
 def test_skips_where_both_are_bad(line):
     segments = query([0.0, 0.1], [0.2, 0.1])
-    best = float(jnp.max(human.segment_values(segments, line)))
+    best = float(jnp.max(synthetic_human.segment_values(segments, line)))
     assert bool(jnp.all(share_of_first(line.replace(skip_below=best + 0.1), segments).answered == 0))
     assert bool(jnp.all(share_of_first(line.replace(skip_below=best - 0.1), segments).answered == 1))
 
 
 def test_teacher_is_a_value():
-    assert human.SYNTHETIC.answer is human.answer
+    assert synthetic_human.SYNTHETIC.answer is synthetic_human.answer

@@ -10,56 +10,48 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 
-# Bottom to top. A module imports from the rows below its own, and from its own row.
+# Bottom to top: rooms, and modules where a room has floors of its own. A module imports from the rows below its own, and from
+# its own row. What is named first counts: a module, then the room that it lies in.
 LAYERS = (
-    {"peps_envs.interface"},
-    {"peps_envs.navigation", "peps_envs.highway.vehicle"},
-    {"peps_envs.highway.collision", "peps_envs.highway.traffic"},
-    {"peps_envs.highway.simulation", "peps_envs.highway.classic"},
-    {"peps_envs.highway.environment", "peps_envs.highway.replay"},
-    {"peps_envs.highway", "peps_envs.highway.presets"},
-    {"peps_envs.registry"},
-    {"peps_envs"},
-    {"peps_envs.brax_bridge"},
-    {
-        "peps_jax.files",
-        "peps_jax.command_line",
-        "peps_jax.memory",
-        "peps_jax.programs",
-    },  # they know nothing of trainings
-    {"peps_jax.config"},
-    {"peps_jax.parts", "peps_jax.parts.trajectory", "peps_jax.parts.networks", "peps_jax.parts.replay"},
-    {f"peps_jax.parts.{name}" for name in ("dynamics", "human", "queries", "sac", "surrogate")},
-    {"peps_jax.methods.method"},
-    {"peps_jax.methods.feedback", "peps_jax.methods.sac"},
-    {f"peps_jax.methods.{name}" for name in ("drlhp", "human", "peps", "policy_shaping")},
-    {"peps_jax.methods"},
-    {f"peps_jax.{name}" for name in ("explicability", "rollout", "train")},
-    {f"peps_jax.{name}" for name in ("evaluate", "planner", "statistics")},
-    {"peps_jax.batch"},
-    {"peps_jax.results"},
-    {f"peps_jax.{name}" for name in ("checkpoint", "film", "plots", "progress", "request")},
-    {"peps_jax.study.scenes"},
-    {"peps_jax.study.participants"},
-    {"peps_jax.study.comparisons", "peps_jax.study.ratings"},
-    {"peps_jax.study.experiment"},
-    {"peps_jax.study", "peps_jax.study.report", "peps_jax.study.__main__"},
-    {"peps_jax.ledger"},
-    {"peps_jax.processes"},
-    {"peps_jax.sweep"},
-    {"peps_jax.reproduce.store"},
-    {"peps_jax.reproduce.study"},
-    {"peps_jax.reproduce.tables", "peps_jax.reproduce.driving"},
-    {"peps_jax.reproduce.figures"},
-    {"peps_jax.reproduce.__main__"},
-    {"peps_jax.reproduce"},
+    ("peps_envs.environment",),
+    ("peps_envs.navigation", "peps_envs.highway.vehicle"),
+    ("peps_envs.highway.collision", "peps_envs.highway.traffic"),
+    ("peps_envs.highway.simulation", "peps_envs.highway.classic"),
+    ("peps_envs.highway",),
+    ("peps_envs.registry",),
+    ("peps_envs",),
+    ("peps_envs.bridges",),
+    ("peps_jax.storage", "peps_jax.command_line", "peps_jax.trajectory"),
+    ("peps_jax.config",),
+    ("peps_jax.learning.networks", "peps_jax.learning.replay"),
+    ("peps_jax.learning", "peps_jax.preferences"),
+    ("peps_jax.methods.method",),
+    ("peps_jax.methods.preference_based", "peps_jax.methods.sac"),
+    *(tuple(f"peps_jax.methods.{name}" for name in ("drlhp", "human_expectation", "peps", "policy_shaping")),),
+    ("peps_jax.methods",),
+    ("peps_jax.train", "peps_jax.rollout", "peps_jax.explicability"),
+    ("peps_jax.evaluate",),
+    ("peps_jax.analysis", "peps_jax.drawing"),
+    ("peps_jax.execution.memory", "peps_jax.execution.compilation_cache", "peps_jax.execution.machine"),
+    ("peps_jax.execution",),
+    ("peps_jax.sweep",),
+    ("peps_jax.reproduce",),
 )
-LAYER_OF = {module: layer for layer, modules in enumerate(LAYERS) for module in modules}
-STRANGERS = next(layer for layer in LAYERS if "peps_jax.parts.sac" in layer)  # parts that know nothing of one another
+LAYER_OF = {room: layer for layer, rooms in enumerate(LAYERS) for room in rooms}
+STRANGERS = {f"peps_jax.learning.{name}" for name in ("dynamics", "sac", "surrogate")}  # know nothing of one another
 FRONT = (
     "peps_jax"  # its __init__ shows what users need, of whatever layer: commands may import it, what they use may not
 )
 COMMAND = "peps_jax.sweep"  # the lowest of them
+
+
+def layer_of(module: str) -> int | None:
+    """The row of a module, or of the nearest room that it lies in; None if neither has one."""
+    if module == FRONT:
+        return LAYER_OF[COMMAND]
+    parts = module.split(".")
+    rooms = (".".join(parts[:length]) for length in range(len(parts), 1, -1))
+    return next((LAYER_OF[room] for room in rooms if room in LAYER_OF), LAYER_OF.get(module))
 
 
 def source_files(root: Path) -> dict[str, Path]:
@@ -96,23 +88,21 @@ def violations(root: Path) -> list[str]:
     for module, path in modules.items():
         if module == FRONT:
             continue
-        if module not in LAYER_OF:
+        if layer_of(module) is None:
             lines.append(f"{module} has no layer: give it a place in LAYERS of tests/test_layers.py")
             continue
         for target in sorted(imported(path, module, modules) - {module}):
-            layer = LAYER_OF.get(target, LAYER_OF[COMMAND] if target == FRONT else None)
-            if layer is None:
-                continue  # it is reported as a module without a layer, or it doesn't exist
-            if layer > LAYER_OF[module]:
+            layer = layer_of(target)
+            if layer is not None and layer > layer_of(module):
                 lines.append(f"{module} imports {target}, which is above it")
             elif {module, target} <= STRANGERS:
-                lines.append(f"{module} imports {target}: parts know networks, replay and trajectory and no other part")
+                lines.append(f"{module} imports {target}: what is learned apart knows nothing of one another")
     return lines
 
 
 def plant(root: Path, file: str, text: str) -> None:
     """A copy of the source tree in which every file is empty, but `file` holds `text`."""
-    for path in [*source_files(ROOT).values(), ROOT / "peps_jax/sweep.py"]:
+    for path in source_files(ROOT).values():
         empty = root / path.relative_to(ROOT)
         empty.parent.mkdir(parents=True, exist_ok=True)
         empty.touch()
@@ -129,7 +119,7 @@ def test_no_arrow_runs_upwards():
     [
         ("envs/peps_envs/navigation.py", "import peps_jax.config", "imports peps_jax.config, which is above it"),
         (
-            "envs/peps_envs/interface.py",
+            "envs/peps_envs/environment.py",
             "from peps_envs.registry import make",
             "imports peps_envs.registry, which is above it",
         ),
@@ -137,12 +127,16 @@ def test_no_arrow_runs_upwards():
         ("peps_jax/train.py", "from peps_jax import evaluate", "imports peps_jax.evaluate, which is above it"),
         ("peps_jax/train.py", "def late():\n    from .sweep import run", "imports peps_jax.sweep, which is above it"),
         (
-            "peps_jax/parts/human.py",
+            "peps_jax/preferences/synthetic_human.py",
             "from ..methods.peps import PEPS",
             "imports peps_jax.methods.peps, which is above it",
         ),
-        ("peps_jax/parts/human.py", "from peps_jax import Config", "imports peps_jax, which is above it"),
-        ("peps_jax/parts/human.py", "from peps_jax.parts import sac", "and no other part"),
+        (
+            "peps_jax/preferences/synthetic_human.py",
+            "from peps_jax import Config",
+            "imports peps_jax, which is above it",
+        ),
+        ("peps_jax/learning/sac.py", "from peps_jax.learning import dynamics", "nothing of one another"),
         ("peps_jax/gadgets.py", "", "peps_jax.gadgets has no layer"),
     ],
 )
@@ -157,10 +151,10 @@ def test_a_planted_import_is_caught(tmp_path, file, line, complaint):
     [
         ("peps_jax/train.py", "from peps_jax import rollout, methods"),
         (
-            "peps_jax/parts/human.py",
-            "from peps_jax.parts import replay\nfrom peps_jax.config import Config\nimport peps_envs",
+            "peps_jax/preferences/synthetic_human.py",
+            "from peps_jax.learning import replay\nfrom peps_jax.config import Config\nimport peps_envs",
         ),
-        ("peps_jax/sweep.py", "from peps_jax import Config, evaluate\nimport numpy"),
+        ("peps_jax/sweep/command.py", "from peps_jax import Config, evaluate\nimport numpy"),
         ("peps_jax/__init__.py", "from peps_jax.sweep import main"),
     ],
 )
@@ -183,7 +177,7 @@ def test_importing_the_library_imports_neither_brax_nor_matplotlib():
     assert not printed.split()
 
 
-@pytest.mark.parametrize("command", ["sweep", "reproduce", "study"])
+@pytest.mark.parametrize("command", ["sweep", "reproduce"])
 def test_a_command_has_a_device_for_every_core(command):
     """Importing it makes no array: JAX would meet its devices before they are as many as the cores."""
     program = f"""

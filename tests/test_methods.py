@@ -11,12 +11,12 @@ from conftest import LineParams, Probe, ProbeParams
 import peps_jax
 from peps_envs import Discrete
 from peps_jax import Config, methods
+from peps_jax.learning import sac
 from peps_jax.methods import drlhp
-from peps_jax.parts import sac
-from peps_jax.parts.trajectory import Transition
 from peps_jax.train import collect_and_ask, init
+from peps_jax.trajectory import Transition
 
-EVERY = ("peps", "sac", "drlhp", "policy_shaping", "human")
+EVERY = ("peps", "sac", "drlhp", "policy_shaping", "human_expectation")
 EPISODES = 6
 
 
@@ -28,7 +28,7 @@ def evaluate():
 def test_the_methods_and_their_order():
     assert tuple(methods.METHODS) == (*EVERY, "drlhp_unscaled", "peps_absolute")
     text = Config.__dataclass_fields__["method"].metadata["help"]
-    places = [text.index(name) for name in ("peps", " sac", "drlhp", "policy_shaping", "human")]
+    places = [text.index(name) for name in ("peps", " sac", "drlhp", "policy_shaping", "human_expectation")]
     assert places == sorted(places)
     assert [name for name in EVERY if methods.get(name).uses_lam] == ["peps"]
 
@@ -140,7 +140,7 @@ def test_every_method_learns_and_acts(line, train, evaluate, method):
     assert bool(jnp.all(jnp.isfinite(evaluation.explicability)))
 
 
-@pytest.mark.parametrize("method", ["sac", "drlhp", "policy_shaping", "human"])
+@pytest.mark.parametrize("method", ["sac", "drlhp", "policy_shaping", "human_expectation"])
 def test_lam_changes_nothing_of_a_method_without_it(line, train, method):
     one, two = (train(line.replace(method=method, lam=lam)).agents for lam in (0.5, 2.4))
     chex.assert_trees_all_equal(one, two)
@@ -189,7 +189,7 @@ def test_the_product_and_each_policy_act_in_environments_of_their_own(line):
 
 def test_the_human_lives_in_the_believed_world(line, train, evaluate):
     belief = LineParams(noise=0.05, slope=-2.0)
-    line = line.replace(method="human", belief=belief)
+    line = line.replace(method="human_expectation", belief=belief)
     result = train(line)
     ended = np.asarray(result.curves["episodes"]) > 0
     for name in ("human_return", "explicability"):
@@ -206,7 +206,7 @@ def test_the_human_lives_in_the_believed_world(line, train, evaluate):
 
 def test_the_human_of_a_true_belief_is_sac(line, train):
     line = line.replace(belief=line.params)
-    human, sac_ = train(line.replace(method="human")), train(line.replace(method="sac"))
+    human, sac_ = train(line.replace(method="human_expectation")), train(line.replace(method="sac"))
     chex.assert_trees_all_close(human.agents, sac_.agents, rtol=1e-4, atol=1e-5)
 
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import peps_envs
-from peps_envs import interface, navigation
+from peps_envs import environment, navigation
 from peps_envs.navigation import NOWHERE, Navigation, NavigationState, make_params
 
 WORLD = Navigation()
@@ -329,7 +329,7 @@ def test_reward_is_step_plus_progress_plus_ends(position, action, progress, extr
         progress = np.hypot(4.5, 3.5) - np.hypot(4.5, 4.25)
     assert after.reward == pytest.approx(-1 + progress + extra, rel=1e-5)
     for name in WORLD.event_names:
-        assert bool(interface.event(WORLD, after.events, name)) == (name == event)
+        assert bool(environment.event(WORLD, after.events, name)) == (name == event)
     assert bool(after.terminated) == (event is not None)
 
 
@@ -394,4 +394,4 @@ def test_an_unknown_parameter_is_refused():
 
 def test_an_unknown_event_is_refused():
     with pytest.raises(ValueError, match=r"^event 'fell': Navigation has goal_reached, pit_reached$"):
-        interface.event(WORLD, jnp.zeros(2, bool), "fell")
+        environment.event(WORLD, jnp.zeros(2, bool), "fell")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from flax import linen as nn
 
-from peps_jax.parts import networks
+from peps_jax.learning import networks
 
 
 def differentiated(layers, rows):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import peps_envs
-from peps_envs.interface import event
+from peps_envs.environment import event
 from peps_envs.navigation import Navigation, inside, make_params
-from peps_jax import planner
+from peps_jax.analysis import navigation_planner
 
 # One row, the goal from x = 4.9 on. Grid points every 0.375, so that full and half steps lead from one to another.
 corridor = partial(make_params, size=(6.0, 1.0), start=(0.375, 0.5), goal=(4.9, 0.0, 6.0, 1.0))
@@ -30,7 +30,7 @@ def corridor_value(x, step=-1.0, progress=1.0, length=0.75):
 @partial(jax.jit, static_argnames=("objective", "resolution"))
 def row(params, belief, objective, lam, resolution=ALIGNED):
     """Values on the middle row of the corridor's grid, and the residual."""
-    plan = planner.solve(params, belief, objective, lam, gamma=GAMMA, resolution=resolution, directions=4)
+    plan = navigation_planner.solve(params, belief, objective, lam, gamma=GAMMA, resolution=resolution, directions=4)
     return plan.values[resolution // 2], plan.residual
 
 
@@ -43,7 +43,9 @@ def places(resolution=ALIGNED):
 def walk(params, belief, objective, resolution, directions):
     """30 steps of the plan: what each brought, and whether the episode went on until then."""
     world = Navigation()
-    plan = planner.solve(params, belief, objective, resolution=resolution, directions=directions, tolerance=0.1)
+    plan = navigation_planner.solve(
+        params, belief, objective, resolution=resolution, directions=directions, tolerance=0.1
+    )
 
     def step(carry, key):
         state, alive = carry
@@ -113,7 +115,7 @@ def test_an_unknown_objective_is_refused():
     with pytest.raises(
         ValueError, match=r"^objective 'retrun' is unknown: did you mean 'return'\? known are .*human, peps$"
     ):
-        planner.solve(CORRIDOR, CORRIDOR, "retrun")
+        navigation_planner.solve(CORRIDOR, CORRIDOR, "retrun")
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,8 @@ import pytest
 from commands import contents, exit_code
 
 import peps_envs
-from peps_jax import batch, plots, processes, results, sweep
+from peps_jax.execution import batches
+from peps_jax.sweep import command, pictures, results, workers
 
 SIZES = [
     *("--num-envs", "4", "--rollout-length", "10", "--warmup-steps", "40", "--batch-size", "16"),
@@ -25,7 +26,7 @@ LINE = ["--env", "line", "--method", "sac", "--seeds", "8", *SIZES]  # four batc
 
 
 def call(*arguments: object) -> int:
-    return exit_code(sweep.main, *arguments)
+    return exit_code(command.main, *arguments)
 
 
 @pytest.fixture
@@ -33,11 +34,11 @@ def team(line, monkeypatch):
     """Threads in place of processes: whoever says which one it is has joined the others already."""
     task = peps_envs.Task(line.env, line.params, {"noisy": line.belief, "true": line.params})
     monkeypatch.setitem(peps_envs.registry._TASKS, "line", lambda: task)
-    monkeypatch.setattr(batch, "CELLS_PER_DEVICE", 1)
-    monkeypatch.setattr(plots, "draw", lambda rows, folder: [])
-    monkeypatch.setattr(processes, "SILENCE", 1.0)
-    monkeypatch.setattr(processes, "BEAT", 0.1)
-    monkeypatch.setattr(processes, "join", lambda _, count, index: processes.Team(index, count, "this run", count))
+    monkeypatch.setattr(batches, "CELLS_PER_DEVICE", 1)
+    monkeypatch.setattr(pictures, "draw", lambda rows, folder: [])
+    monkeypatch.setattr(workers, "SILENCE", 1.0)
+    monkeypatch.setattr(workers, "BEAT", 0.1)
+    monkeypatch.setattr(workers, "join", lambda _, count, index: workers.Team(index, count, "this run", count))
 
 
 def member(index: int, count: int) -> list[str]:
@@ -81,14 +82,14 @@ def test_a_process_that_never_comes_is_said_and_the_others_are_kept(team, tmp_pa
 
 def test_a_process_that_fails_says_why_to_all(team, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(threading, "excepthook", lambda arguments: None)
-    compiled = batch.program
+    compiled = batches.program
 
     def refuse(*arguments):
         if threading.current_thread() in failing:
             raise MemoryError("no room for this")
         return compiled(*arguments)
 
-    monkeypatch.setattr(batch, "program", refuse)
+    monkeypatch.setattr(batches, "program", refuse)
     folder, codes = tmp_path / "out", {}
     act = lambda index: codes.update({index: call(*LINE, *member(index, 2), "--out", folder)})
     threads = [threading.Thread(target=act, args=(index,)) for index in (0, 1)]
@@ -103,7 +104,7 @@ def test_a_process_that_fails_says_why_to_all(team, tmp_path, capsys, monkeypatc
 
 
 def test_without_process_0_the_others_are_kept(team, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(processes, "PATIENCE", 0.5)
+    monkeypatch.setattr(workers, "PATIENCE", 0.5)
     assert run_together(tmp_path / "out", [1], 2, *LINE) == {1: 2}
     error = capsys.readouterr().err
     assert "process 0 hasn't shared out the batches" in error
@@ -145,7 +146,7 @@ def test_processes_that_do_not_come_together(capsys, tmp_path, monkeypatch):
     class Failed:
         returncode, stdout, stderr = 1, "", "Traceback\nValueError: coordinator_address should be defined.\n"
 
-    monkeypatch.setattr(processes.subprocess, "run", lambda *arguments, **named: Failed)
+    monkeypatch.setattr(workers.subprocess, "run", lambda *arguments, **named: Failed)
     assert call("--distributed", "--out", tmp_path / "out") == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
@@ -154,19 +155,19 @@ def test_processes_that_do_not_come_together(capsys, tmp_path, monkeypatch):
 
 
 def test_life_and_death_are_told_apart(tmp_path, monkeypatch):
-    monkeypatch.setattr(processes, "SILENCE", 0.3)
-    monkeypatch.setattr(processes, "BEAT", 0.05)
+    monkeypatch.setattr(workers, "SILENCE", 0.3)
+    monkeypatch.setattr(workers, "BEAT", 0.05)
     (tmp_path / "progress").mkdir()
-    teams = [processes.Team(index, 4, "now") for index in range(4)]
-    processes.Life(tmp_path, teams[1]._replace(run="earlier")).end(processes.DONE)
-    done, alive = processes.Life(tmp_path, teams[2]), processes.Life(tmp_path, teams[3])
-    others = processes.Others(tmp_path, teams[0])
+    teams = [workers.Team(index, 4, "now") for index in range(4)]
+    workers.Life(tmp_path, teams[1]._replace(run="earlier")).end(workers.DONE)
+    done, alive = workers.Life(tmp_path, teams[2]), workers.Life(tmp_path, teams[3])
+    others = workers.Others(tmp_path, teams[0])
     assert others.ends() == {}
-    done.end(processes.DONE)
+    done.end(workers.DONE)
     end = time.monotonic() + 0.6
     while time.monotonic() < end:
         ends = others.ends()
         time.sleep(0.02)
-    assert ends == {1: "no sign of life for 0 s", 2: processes.DONE}
-    alive.end(processes.FAILED, "because")
+    assert ends == {1: "no sign of life for 0 s", 2: workers.DONE}
+    alive.end(workers.FAILED, "because")
     assert others.ends()[3] == "failed: because"

@@ -9,19 +9,21 @@ import numpy as np
 import pytest
 from conftest import Line, LineParams
 
-from peps_jax import batch, files, methods, programs
+from peps_jax import methods
+from peps_jax.execution import batches, compilation_cache
+from peps_jax.storage import files
 
 EPISODES = 2
 
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    monkeypatch.setenv(programs.VARIABLE, str(tmp_path / "kept"))
+    monkeypatch.setenv(compilation_cache.VARIABLE, str(tmp_path / "kept"))
     return tmp_path / "kept"
 
 
 def kept(about, make):
-    return programs.kept(about, make, jax.devices()[:1])
+    return compilation_cache.kept(about, make, jax.devices()[:1])
 
 
 def double():
@@ -44,7 +46,7 @@ def test_what_was_made_is_found_again(place):
 def test_what_would_differ_is_made_anew(place, monkeypatch, change):
     kept("a", double)
     if change == "code":
-        monkeypatch.setattr(programs, "_code", lambda: "other code")
+        monkeypatch.setattr(compilation_cache, "_code", lambda: "other code")
     if change == "flags":
         monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=1")
     if change == "setting":
@@ -65,7 +67,7 @@ def test_a_damaged_file_is_made_anew(place, damage):
 
 
 def test_the_longest_unused_make_room(place, monkeypatch):
-    monkeypatch.setattr(programs, "LIMIT", 3_000)
+    monkeypatch.setattr(compilation_cache, "LIMIT", 3_000)
     for age, name in enumerate("abc"):
         kept(name, lambda: {"bytes": b"0" * 1_000})
         newest = max(place.iterdir(), key=lambda path: path.stat().st_mtime_ns)
@@ -79,7 +81,7 @@ def test_the_longest_unused_make_room(place, monkeypatch):
 def test_nothing_is_kept_where_that_is_turned_off_or_impossible(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     for value in ("", str(tmp_path / "file")):
-        monkeypatch.setenv(programs.VARIABLE, value)
+        monkeypatch.setenv(compilation_cache.VARIABLE, value)
         assert kept("a", double)["double"](np.float32(3)) == 6
         with pytest.raises(AssertionError):
             kept("a", refuse)
@@ -87,24 +89,26 @@ def test_nothing_is_kept_where_that_is_turned_off_or_impossible(tmp_path, monkey
 
 
 def test_foreign_code_has_no_name(tiny, monkeypatch):
-    assert batch._written(tiny) == batch._written(tiny.replace(seed=1, lam=3.0))
-    assert batch._written(tiny) != batch._written(tiny.replace(batch_size=17))
-    assert batch._written(tiny.replace(env=Line(), params=LineParams(), belief=LineParams())) is None
+    assert batches._written(tiny) == batches._written(tiny.replace(seed=1, lam=3.0))
+    assert batches._written(tiny) != batches._written(tiny.replace(batch_size=17))
+    assert batches._written(tiny.replace(env=Line(), params=LineParams(), belief=LineParams())) is None
     mine = methods.get("sac")._replace(name="mine", init=lambda key, config: ())
     monkeypatch.setitem(methods.METHODS, "mine", mine)
-    assert batch._written(tiny.replace(method="mine")) is None
+    assert batches._written(tiny.replace(method="mine")) is None
 
 
 PROGRAM = """
 import sys
 import numpy as np
-from peps_jax import Config, batch, programs
+from peps_jax import Config
+from peps_jax.execution import batches
+from peps_jax.execution import compilation_cache
 sizes = dict(total_steps=40, num_envs=4, rollout_length=10, warmup_steps=0, batch_size=8, hidden_sizes=(4,), updates_per_step=0.1)
 cells = [Config(method="sac", seed=seed, **sizes) for seed in range(2)]
-(planned,) = batch.plan(cells, 2)
+(planned,) = batches.plan(cells, 2)
 if sys.argv[1] == "known":
-    batch.Program._compile = None
-program, _ = batch.program(cells[0], planned, 2)
+    batches.Program._compile = None
+program, _ = batches.program(cells[0], planned, 2)
 finished, _ = program.run(cells)
 print([one.evaluation.return_.tolist() for one in finished], program.bytes_used)
 """

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from peps_jax.parts import queries
-from peps_jax.parts.trajectory import Trajectory, Transition
+from peps_jax.preferences import queries
+from peps_jax.trajectory import Trajectory, Transition
 
 logits = hnp.arrays(np.float32, (4, 6), elements=st.floats(-30, 30, width=32))
 

@@ -6,8 +6,8 @@ import numpy as np
 from conftest import Line, Probe
 
 from peps_envs import Discrete
-from peps_jax.parts import replay
-from peps_jax.parts.trajectory import Transition
+from peps_jax.learning import replay
+from peps_jax.trajectory import Transition
 
 
 def numbered(start, number):

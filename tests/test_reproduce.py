@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 from commands import exit_code, is_one_complaint
 
-from peps_jax import Config, batch, plots, results
+from peps_jax import Config
+from peps_jax.analysis.intervals import Estimate
+from peps_jax.drawing import panels
+from peps_jax.execution import batches
 from peps_jax.reproduce import __main__ as command
-from peps_jax.reproduce import driving, figures, store, study, tables
+from peps_jax.reproduce import figures, store, tables, trainings
+from peps_jax.reproduce.driving import experiment, figure3
 from peps_jax.reproduce.store import Record, Store
-from peps_jax.reproduce.study import DOMAINS, METHODS, Study
-from peps_jax.statistics import Estimate
-from peps_jax.study import experiment
+from peps_jax.reproduce.trainings import DOMAINS, METHODS, Study
+from peps_jax.storage.tables import markdown
 
 EPISODES = 4
 
@@ -31,8 +34,8 @@ def no_training(monkeypatch):
     def refuse(*arguments, **settings):
         raise AssertionError("compiled")
 
-    monkeypatch.setattr(batch, "Program", refuse)
-    monkeypatch.setattr(study, "_plan_and_walk", refuse)
+    monkeypatch.setattr(batches, "Program", refuse)
+    monkeypatch.setattr(trainings, "_plan_and_walk", refuse)
 
 
 def made_up(value: float, failed: bool = False, horizon: int = 6) -> Record:
@@ -184,10 +187,10 @@ def test_the_typical_training_is_the_median_one(tiny, monkeypatch):
 def test_what_the_driving_study_trained_is_kept(tmp_path, tiny, capsys, monkeypatch):
     monkeypatch.setattr(experiment, "METHODS", ("sac",))
     made, asked = Study(tiny, 2, EPISODES), []
-    part, over_lam = driving._parts(made)
-    assert driving._path(part, tmp_path) != driving._path(over_lam, tmp_path)
+    part, over_lam = figure3._parts(made)
+    assert figure3._path(part, tmp_path) != figure3._path(over_lam, tmp_path)
     assert part.steps == tiny.total_steps, "the length that was asked for"
-    assert driving._parts(Study(Config(), 2, EPISODES))[0].steps == experiment.STEPS
+    assert figure3._parts(Study(Config(), 2, EPISODES))[0].steps == experiment.STEPS
 
     def pretend(part):
         asked.append(part)
@@ -195,14 +198,14 @@ def test_what_the_driving_study_trained_is_kept(tmp_path, tiny, capsys, monkeypa
         return jax.tree.map(lambda leaf: np.full((1, 2, *leaf.shape), 3, leaf.dtype), like)
 
     monkeypatch.setattr(experiment, "run_part", pretend)
-    first, again = driving._make(part, tmp_path), driving._make(part, tmp_path)
+    first, again = figure3._make(part, tmp_path), figure3._make(part, tmp_path)
     assert asked == [part], "the second time from the file"
     jax.tree.map(np.testing.assert_array_equal, first, again)
-    driving.check(made, tmp_path)
+    figure3.check(made, tmp_path)
     with pytest.raises(ValueError, match="made with other settings or code"):
-        driving.check(Study(tiny.replace(total_steps=320), 2, EPISODES), tmp_path)
+        figure3.check(Study(tiny.replace(total_steps=320), 2, EPISODES), tmp_path)
     Store(tmp_path / "other", tiny, EPISODES, seeds=2).open()
-    driving._path(part, tmp_path / "other").write_bytes(b"PK half a file")
+    figure3._path(part, tmp_path / "other").write_bytes(b"PK half a file")
     assert call(["figure3", "--seeds", 2, "--out", tmp_path / "other"], tiny) == 2
     error = capsys.readouterr().err
     assert "can't be read: remove it" in error
@@ -221,7 +224,7 @@ def test_numbers_in_a_table():
 
 def test_markdown_and_latex():
     head, rows = ["a", "b", "c"], [["x", "50 %", "1 ± 2"], ["x", "a_b", "–"], ["y", "r̂", "λ"]]
-    assert results.markdown(head, rows).splitlines()[1:3] == ["|---|---|---|", "| x | 50 % | 1 ± 2 |"]
+    assert markdown(head, rows).splitlines()[1:3] == ["|---|---|---|", "| x | 50 % | 1 ± 2 |"]
     text = tables.latex(head, rows)
     assert text.startswith("\\begin{tabular}{llr}\n\\toprule\na & b & c \\\\\n\\midrule\n")
     assert r"x & 50 \% & 1 $\pm$ 2 \\" in text
@@ -274,9 +277,9 @@ def test_points_at_one_place_share_a_label():
 
 
 def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_training, monkeypatch):
-    monkeypatch.setattr(plots, "DOTS", 30)
-    monkeypatch.setattr(driving.experiment, "run", lambda parts, make: {part.method for part in parts})
-    monkeypatch.setattr(driving.report, "write", lambda found, folder: [folder / f"figure3 of {len(found)} methods"])
+    monkeypatch.setattr(panels, "DOTS", 30)
+    monkeypatch.setattr(figure3.experiment, "run", lambda parts, make: {part.method for part in parts})
+    monkeypatch.setattr(figure3.report, "write", lambda found, folder: [folder / f"figure3 of {len(found)} methods"])
     fill(tmp_path, tiny, seeds=3)
     assert call(["all", "--seeds", 3, "--out", tmp_path], tiny) == 0
     written = {path.name for path in tmp_path.iterdir()} - {store.HEAD, store.CELLS}
@@ -301,13 +304,13 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
 
 @pytest.mark.slow
 def test_a_stopped_table_continues(tmp_path, capsys, tiny, monkeypatch):
-    monkeypatch.setattr(study, "PLANNER", {name: dict(points=1, resolution=13) for name in study.PLANNER})
-    monkeypatch.setattr(batch, "CELLS_PER_DEVICE", 1)  # two batches
+    monkeypatch.setattr(trainings, "PLANNER", {name: dict(points=1, resolution=13) for name in trainings.PLANNER})
+    monkeypatch.setattr(batches, "CELLS_PER_DEVICE", 1)  # two batches
     for module in (tables, figures):
         monkeypatch.setattr(module, "DOMAINS", ("nav-d1",))
         monkeypatch.setattr(module, "METHODS", ("peps", "sac"))
         monkeypatch.setattr(module, "BASELINES", ("sac",))
-    seeds, compiled, asked = 4, batch.program, []
+    seeds, compiled, asked = 4, batches.program, []
     made, kept = Study(tiny, seeds, EPISODES), Store(tmp_path, tiny, EPISODES, seeds)
     kept.open()
     plans = [made.planned("nav-d1", objective) for objective in ("peps", "human")]
@@ -320,7 +323,7 @@ def test_a_stopped_table_continues(tmp_path, capsys, tiny, monkeypatch):
             raise KeyboardInterrupt
         return compiled(cell, *arguments)
 
-    monkeypatch.setattr(batch, "program", interrupt_the_last)
+    monkeypatch.setattr(batches, "program", interrupt_the_last)
     arguments = ["table1", "--seeds", seeds, "--out", tmp_path]
     assert call(arguments, tiny) == 130
     assert "the same command continues" in capsys.readouterr().err

@@ -17,7 +17,9 @@ import pytest
 from commands import contents, exit_code
 
 import peps_envs
-from peps_jax import batch, checkpoint, files, ledger, plots, programs, results, sweep
+from peps_jax.execution import batches, checkpoints, compilation_cache
+from peps_jax.storage import files
+from peps_jax.sweep import command, journal, pictures, results
 from peps_jax.train import init
 
 # a real death takes the threads of Orbax with it; here they come back to a loop that is no more
@@ -69,14 +71,14 @@ def line_task(line, monkeypatch):
     """The line as an environment that command lines know, in batches of two cells, and a moment's drawing."""
     task = peps_envs.Task(line.env, line.params, {"noisy": line.belief, "true": line.params})
     monkeypatch.setitem(peps_envs.registry._TASKS, "line", lambda: task)
-    monkeypatch.setattr(batch, "CELLS_PER_DEVICE", 1)
-    monkeypatch.setattr(plots, "draw", lambda rows, folder: [])
+    monkeypatch.setattr(batches, "CELLS_PER_DEVICE", 1)
+    monkeypatch.setattr(pictures, "draw", lambda rows, folder: [])
     yield
     DEATH.disarm()
 
 
 def call(*arguments: object) -> int:
-    return exit_code(sweep.main, *arguments)
+    return exit_code(command.main, *arguments)
 
 
 def status(folder: Path) -> str:
@@ -89,8 +91,8 @@ def made(line, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         task = peps_envs.Task(line.env, line.params, {"noisy": line.belief, "true": line.params})
         patch.setitem(peps_envs.registry._TASKS, "line", lambda: task)
-        patch.setattr(batch, "CELLS_PER_DEVICE", 1)
-        patch.setattr(plots, "draw", lambda rows, folder: [])
+        patch.setattr(batches, "CELLS_PER_DEVICE", 1)
+        patch.setattr(pictures, "draw", lambda rows, folder: [])
         folder = tmp_path_factory.mktemp("whole") / "out"
         assert call(*LINE, "--out", folder) == 0
         stopped = tmp_path_factory.mktemp("stopped") / "out"
@@ -114,7 +116,7 @@ def stopped(made, tmp_path):
 
 def stop_after(patch, chunks: int) -> None:
     """SIGTERM comes in that chunk."""
-    advanced, left = sweep.Keeper.advanced, [chunks]
+    advanced, left = command.Keeper.advanced, [chunks]
 
     def hear(self, *arguments):
         left[0] -= 1
@@ -122,7 +124,7 @@ def stop_after(patch, chunks: int) -> None:
             os.kill(os.getpid(), signal.SIGTERM)
         advanced(self, *arguments)
 
-    patch.setattr(sweep.Keeper, "advanced", hear)
+    patch.setattr(command.Keeper, "advanced", hear)
 
 
 # --- stopped and killed ---------------------------------------------------------------------------------------------------
@@ -134,7 +136,7 @@ def test_a_terminated_sweep_says_how_to_continue_and_does(whole, tmp_path, capsy
         assert call(*LINE, "--out", tmp_path) == 143
     error = capsys.readouterr().err
     assert (
-        f"2 of 4 cells are finished and kept in {tmp_path}; continue with: {sweep.PROG} --resume --out {tmp_path}"
+        f"2 of 4 cells are finished and kept in {tmp_path}; continue with: {command.PROG} --resume --out {tmp_path}"
         in error
     )
     assert status(tmp_path) == "interrupted"
@@ -152,7 +154,7 @@ def test_killed_at_the_very_end(whole, tmp_path, monkeypatch, capsys):
         raise KilledError
 
     with monkeypatch.context() as patch:
-        patch.setattr(ledger, "close", die)
+        patch.setattr(journal, "close", die)
         with pytest.raises(KilledError):
             call(*LINE, "--out", tmp_path)
     assert status(tmp_path) == "complete"
@@ -166,7 +168,7 @@ def test_killed_at_the_very_end(whole, tmp_path, monkeypatch, capsys):
 def test_killed_anywhere_and_continued(whole, tmp_path, monkeypatch):
     """The same command again and again, as a script would give it, until the sweep is complete; and so on."""
     chance, kills, trainings = random.Random(0), 0, 0
-    advanced, run = sweep.Keeper.advanced, batch.Program.run
+    advanced, run = command.Keeper.advanced, batches.Program.run
 
     def hear(self, *arguments):
         DEATH.tick()
@@ -178,8 +180,8 @@ def test_killed_anywhere_and_continued(whole, tmp_path, monkeypatch):
         assert not {f"line-sac-seed{cell.seed}" for cell in cells} & set().union(*done), "a finished cell runs again"
         return run(self, cells, *arguments)
 
-    monkeypatch.setattr(sweep.Keeper, "advanced", hear)
-    monkeypatch.setattr(batch.Program, "run", run_unfinished)
+    monkeypatch.setattr(command.Keeper, "advanced", hear)
+    monkeypatch.setattr(batches.Program, "run", run_unfinished)
     while kills < KILLS:
         folder = tmp_path / str(trainings)
         trainings += 1
@@ -204,7 +206,7 @@ def compiled(tmp_path_factory):
     """The environment of processes that share what they compile."""
     cache = str(tmp_path_factory.mktemp("compiled"))
     return os.environ | {
-        programs.VARIABLE: cache,
+        compilation_cache.VARIABLE: cache,
         "JAX_COMPILATION_CACHE_DIR": cache,
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
@@ -260,7 +262,7 @@ def damage(path: Path, chance: random.Random) -> None:
 
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(stopped, tmp_path, line, capsys):
     cells = [line.replace(method="sac", seed=seed) for seed in (2, 3)]
-    empty = batch.empty_progress(cells[0], 2)
+    empty = batches.empty_progress(cells[0], 2)
     about = json.loads(files.unseal(next(stopped.glob("progress/*/rounds-*3/checkpoint.json")).read_bytes()))
     about = {name: about[name] for name in ("peps-jax", "jax", "jaxlib", "devices", "configuration", "cells")}
     source = stopped / "progress" / "batch-00001"
@@ -272,7 +274,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(stopped, tmp_path, lin
         shutil.copytree(source, folder)
         damaged = sorted(path for path in folder.glob("rounds-00000003/**/*") if path.is_file())
         damage(chance.choice(damaged), chance)
-        found = checkpoint.Checkpoints(folder, about).latest(empty)
+        found = checkpoints.Checkpoints(folder, about).latest(empty)
         assert found.rounds == 2
         assert "is damaged" in capsys.readouterr().err
         if before is not None:
@@ -280,7 +282,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(stopped, tmp_path, lin
         before = found
         if number == 0:
             damage(chance.choice([path for path in folder.rglob("*") if path.is_file()]), chance)
-            assert checkpoint.Checkpoints(folder, about).latest(empty) is None, "then from the beginning"
+            assert checkpoints.Checkpoints(folder, about).latest(empty) is None, "then from the beginning"
 
 
 @pytest.mark.parametrize(
@@ -302,25 +304,27 @@ def test_a_sweep_with_damaged_files_is_continued(pattern, said, stopped, whole, 
 
 def test_a_state_is_restored_as_it_was(line, tmp_path):
     config = line.replace(method="peps", seed=3)
-    state = jax.jit(jax.vmap(init))(batch.stack([config, config.replace(seed=4)]))
-    progress = batch.Progress(7, batch._on_host(state, 2), {"return_": np.array([[1.0, np.nan]] * 2, np.float32)}, 1.25)
-    checkpoints = checkpoint.Checkpoints(tmp_path / "deep" / "folder", {"of": "this"})
-    empty = batch.empty_progress(config, 2)
-    assert checkpoints.latest(empty) is None
-    checkpoints.save(progress)
-    restored = checkpoints.latest(empty)
+    state = jax.jit(jax.vmap(init))(batches.stack([config, config.replace(seed=4)]))
+    progress = batches.Progress(
+        7, batches._on_host(state, 2), {"return_": np.array([[1.0, np.nan]] * 2, np.float32)}, 1.25
+    )
+    kept = checkpoints.Checkpoints(tmp_path / "deep" / "folder", {"of": "this"})
+    empty = batches.empty_progress(config, 2)
+    assert kept.latest(empty) is None
+    kept.save(progress)
+    restored = kept.latest(empty)
     jax.tree.map(np.testing.assert_array_equal, restored, progress)
     assert jax.tree.structure(restored.state) == jax.tree.structure(progress.state)
-    with pytest.raises(checkpoint.IncompatibleError, match="has of this, not that"):
-        checkpoint.Checkpoints(tmp_path / "deep" / "folder", {"of": "that"}).latest(empty)
-    with pytest.raises(checkpoint.IncompatibleError, match="doesn't have"):
-        checkpoints.latest(batch.empty_progress(line.replace(method="sac"), 2))
+    with pytest.raises(checkpoints.IncompatibleError, match="has of this, not that"):
+        checkpoints.Checkpoints(tmp_path / "deep" / "folder", {"of": "that"}).latest(empty)
+    with pytest.raises(checkpoints.IncompatibleError, match="doesn't have"):
+        kept.latest(batches.empty_progress(line.replace(method="sac"), 2))
 
 
 def test_checkpoints_by_the_clock_take_a_small_share_of_it(monkeypatch):
     clock = [0.0]
-    monkeypatch.setattr(checkpoint.time, "monotonic", lambda: clock[0])
-    rhythm = checkpoint.Rhythm(60.0)
+    monkeypatch.setattr(checkpoints.time, "monotonic", lambda: clock[0])
+    rhythm = checkpoints.Rhythm(60.0)
     spent = 0.0
     for _ in range(10_000):
         clock[0] += 3.0
@@ -329,7 +333,7 @@ def test_checkpoints_by_the_clock_take_a_small_share_of_it(monkeypatch):
                 clock[0] += 2.0
                 spent += 2.0
     assert 0.005 * clock[0] < spent < 0.02 * clock[0]
-    assert checkpoint.Rhythm(0.0).due()
+    assert checkpoints.Rhythm(0.0).due()
 
 
 # --- refused --------------------------------------------------------------------------------------------------------------
@@ -445,10 +449,10 @@ def test_a_full_disk_is_told_from_what_orbax_raises(line, tmp_path, monkeypatch)
         def __init__(self, *arguments):
             raise ValueError("RESOURCE_EXHAUSTED: Error writing 'x': No space left on device [source locations]")
 
-    state = batch._on_host(jax.jit(jax.vmap(init))(batch.stack([line.replace(method="sac")])), 1)
-    monkeypatch.setattr(checkpoint._orbax(), "Checkpointer", Full)
+    state = batches._on_host(jax.jit(jax.vmap(init))(batches.stack([line.replace(method="sac")])), 1)
+    monkeypatch.setattr(checkpoints._orbax(), "Checkpointer", Full)
     with pytest.raises(files.NotWrittenError, match="can't be written: No space left on device"):
-        checkpoint.Checkpoints(tmp_path / "new", {}).save(batch.Progress(1, state, {}, 0.0))
+        checkpoints.Checkpoints(tmp_path / "new", {}).save(batches.Progress(1, state, {}, 0.0))
     assert not list((tmp_path / "new").iterdir())
 
 
@@ -468,8 +472,8 @@ def test_files_are_whole_or_not_there(tmp_path):
 
 
 def test_a_plan_belongs_to_what_it_was_made_for(tmp_path):
-    plan = ledger.Plan((ledger.Planned(("a", "b"), 2),), ((0,), ()), "now")
-    ledger.Ledger(tmp_path, {"jax": "1"}).begin(plan)
-    assert ledger.Ledger(tmp_path, {"jax": "1"}).plan() == plan
+    plan = journal.Plan((journal.Planned(("a", "b"), 2),), ((0,), ()), "now")
+    journal.Ledger(tmp_path, {"jax": "1"}).begin(plan)
+    assert journal.Ledger(tmp_path, {"jax": "1"}).plan() == plan
     with pytest.raises(ValueError, match="was begun with jax 1, and this is 2"):
-        ledger.Ledger(tmp_path, {"jax": "2"}).plan()
+        journal.Ledger(tmp_path, {"jax": "2"}).plan()

@@ -9,8 +9,8 @@ import pytest
 from conftest import Probe, ProbeParams
 
 from peps_envs import Discrete
-from peps_jax.parts import sac
-from peps_jax.parts.trajectory import Transition
+from peps_jax.learning import sac
+from peps_jax.trajectory import Transition
 
 
 def test_tanh_jacobian_against_a_numeric_derivative():

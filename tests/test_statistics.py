@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import stats
 
-from peps_jax.statistics import estimate, interquartile_mean, mean, probability_of_improvement
+from peps_jax.analysis.intervals import estimate, interquartile_mean, mean, probability_of_improvement
 
 matrices = arrays(np.float64, st.tuples(st.integers(2, 6), st.just(3)), elements=st.integers(-5, 5).map(float))
 

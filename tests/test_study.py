@@ -10,10 +10,10 @@ import pytest
 from commands import exit_code, is_one_complaint
 
 from peps_envs.highway.vehicle import FASTER, IDLE, LANE_LEFT, SLOWER
-from peps_jax import film
-from peps_jax.study import __main__ as command
-from peps_jax.study import comparisons, experiment, participants, ratings, report
-from peps_jax.study import scenes as road_scenes
+from peps_jax.drawing import driving
+from peps_jax.reproduce.driving import __main__ as command
+from peps_jax.reproduce.driving import comparisons, experiment, participants, ratings, report
+from peps_jax.reproduce.driving import scenes as road_scenes
 
 PLANS = {
     "steer": [LANE_LEFT, FASTER, *[IDLE] * 6],
@@ -172,8 +172,8 @@ def test_groups_of_raters(scenes):
 
 def test_pictures(scenes, tmp_path):
     shown = {name: road_scenes.typical(seen) for name, seen in scenes.items()}
-    film.strips(shown, "a note").savefig(tmp_path / "strips.png")
-    film.animate({"steer": shown["steer"]}, tmp_path / "film.gif")
+    driving.strips(shown, "a note").savefig(tmp_path / "strips.png")
+    driving.animate({"steer": shown["steer"]}, tmp_path / "film.gif")
     from PIL import Image
 
     with Image.open(tmp_path / "film.gif") as gif:
@@ -184,9 +184,9 @@ def test_pictures(scenes, tmp_path):
 
 def test_a_moment_lies_between_two_steps(scenes):
     scene = road_scenes.typical(scenes["steer"])
-    early, middle, late = (film.moment(scene, time) for time in (1.0, 1.5, 2.0))
+    early, middle, late = (driving.moment(scene, time) for time in (1.0, 1.5, 2.0))
     np.testing.assert_allclose(middle.x, (early.x + late.x) / 2)
-    wreck = film.moment(road_scenes.typical(scenes["idle"]), 20.0)
+    wreck = driving.moment(road_scenes.typical(scenes["idle"]), 20.0)
     assert wreck.crashed.all()
 
 

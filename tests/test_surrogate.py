@@ -10,8 +10,8 @@ import pytest
 from conftest import Point
 from scipy.stats import spearmanr
 
-from peps_jax.parts import surrogate
-from peps_jax.parts.trajectory import Preferences, Segments, Transition
+from peps_jax.learning import surrogate
+from peps_jax.trajectory import Preferences, Segments, Transition
 
 NUMBER = 600
 

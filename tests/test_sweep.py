@@ -15,7 +15,8 @@ from commands import exit_code, is_one_complaint
 
 import peps_envs
 import peps_jax
-from peps_jax import batch, memory, plots, results, sweep
+from peps_jax.execution import batches, memory
+from peps_jax.sweep import command, pictures, results
 from peps_jax.train import finish, init
 
 EPISODES = 4
@@ -36,7 +37,7 @@ def tiny_flags(tiny) -> list[str]:
 
 
 def call(arguments: list[str]) -> int:
-    return exit_code(sweep.main, *arguments)
+    return exit_code(command.main, *arguments)
 
 
 def refuse_to_compile(*arguments):
@@ -73,9 +74,9 @@ def refuse_to_compile(*arguments):
     ],
 )
 def test_bad_input_is_one_line(arguments, parts, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(batch, "Program", refuse_to_compile)
+    monkeypatch.setattr(batches, "Program", refuse_to_compile)
     assert call([*arguments.split(), "--out", str(tmp_path / "out")]) == 2
-    assert is_one_complaint(capsys.readouterr(), sweep.PROG, parts)
+    assert is_one_complaint(capsys.readouterr(), command.PROG, parts)
     assert not list(tmp_path.iterdir())
 
 
@@ -96,7 +97,7 @@ def test_a_file_is_no_folder(tmp_path, capsys):
 
 
 def test_too_little_memory_is_said_before_compiling(tmp_path, capsys, monkeypatch, tiny):
-    monkeypatch.setattr(batch, "Program", refuse_to_compile)
+    monkeypatch.setattr(batches, "Program", refuse_to_compile)
     monkeypatch.setattr(memory, "available_bytes", lambda devices: 10_000)
     assert call([*tiny_flags(tiny), "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
@@ -113,11 +114,11 @@ def test_every_field_is_a_flag(capsys):
 
 def test_one_device_per_core_unless_told_otherwise(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--some_flag=1")
-    sweep.use_every_core()
+    command.use_every_core()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     assert os.environ["XLA_FLAGS"] == f"--some_flag=1 --xla_force_host_platform_device_count={cores}"
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=7")
-    sweep.use_every_core()
+    command.use_every_core()
     assert os.environ["XLA_FLAGS"] == "--xla_force_host_platform_device_count=7"
 
 
@@ -134,21 +135,21 @@ def test_importing_the_library_meets_no_device():
 
 
 def test_worlds_share_a_program_and_methods_do_not(tiny, monkeypatch):
-    monkeypatch.setattr(batch, "memory_need", lambda config, num_episodes: memory.Need(1000, 1000))
+    monkeypatch.setattr(batches, "memory_need", lambda config, num_episodes: memory.Need(1000, 1000))
     cells = [tiny.replace(env=env, method=method) for env in ("nav-d1", "nav-d3") for method in ("peps", "sac")]
-    planned = batch.plan(cells, EPISODES, free=10**9)
+    planned = batches.plan(cells, EPISODES, free=10**9)
     assert [one.cells for one in planned] == [(0, 2), (1, 3)]
 
 
 def test_what_does_not_fit_is_split_into_batches_of_one_size(line):
     cells = [line.replace(seed=seed) for seed in range(7)]
-    need = batch.memory_need(line, EPISODES)
+    need = batches.memory_need(line, EPISODES)
     two_per_device = int((memory.bytes_needed(need, 2, together=False) + 100) / memory.AVAILABLE_SHARE)
-    planned = batch.plan(cells, EPISODES, free=two_per_device)
+    planned = batches.plan(cells, EPISODES, free=two_per_device)
     assert [one.slots for one in planned] == [4, 4]
     assert [place for one in planned for place in one.cells] == list(range(7))
     with pytest.raises(memory.OutOfMemoryError, match="each of 2 devices"):
-        batch.plan(cells, EPISODES, free=need.working)
+        batches.plan(cells, EPISODES, free=need.working)
 
 
 def test_side_by_side_every_cell_needs_its_working_memory():
@@ -160,7 +161,7 @@ def test_side_by_side_every_cell_needs_its_working_memory():
 
 
 def test_predicted_memory_grows_as_what_it_counts(line):
-    need = lambda **changes: batch.memory_need(line.replace(method="sac", **changes), EPISODES)
+    need = lambda **changes: batches.memory_need(line.replace(method="sac", **changes), EPISODES)
     base, wider, longer = need(batch_size=1024), need(batch_size=2048), need(total_steps=16_000)
     assert 1.5 * base.working < wider.working < 2.5 * base.working
     transition = 4 * (1 + 1 + 1 + 1 + 1)  # bytes: two observations, action, reward, terminated
@@ -171,8 +172,8 @@ def test_predicted_memory_grows_as_what_it_counts(line):
 @pytest.mark.parametrize(("method", "width", "size"), [("sac", 128, 256), ("peps", 64, 256)])
 def test_predicted_memory_is_what_xla_reports(method, width, size):
     config = peps_jax.Config(method=method, hidden_sizes=(width, width), batch_size=size, total_steps=32_000)
-    used = batch.Program(config, 2, 100, jax.devices()[:1]).bytes_used
-    predicted = memory.bytes_needed(batch.memory_need(config, 100), 2, together=False)
+    used = batches.Program(config, 2, 100, jax.devices()[:1]).bytes_used
+    predicted = memory.bytes_needed(batches.memory_need(config, 100), 2, together=False)
     assert 0.97 * used < predicted < 1.2 * used
 
 
@@ -193,10 +194,10 @@ def test_values_in_use_at_once_are_counted():
 
 @pytest.mark.parametrize("num_rounds", [1, 2, 4, 39, 75, 97, 400, 997, 5003, 10_000])
 def test_chunks_make_whole_trainings_of_at_most_two_programs(num_rounds):
-    chunks = batch.chunk_lengths(num_rounds)
+    chunks = batches.chunk_lengths(num_rounds)
     assert sum(chunks) == num_rounds
     assert len(set(chunks)) <= 2
-    assert len(chunks) <= 5 * batch.REPORTS
+    assert len(chunks) <= 5 * batches.REPORTS
 
 
 # --- running --------------------------------------------------------------------------------------------------------------
@@ -277,7 +278,7 @@ def line_task(line, monkeypatch):
 
 @pytest.mark.slow
 def test_every_method_is_swept_and_loaded(line, line_task, tmp_path):
-    names = ("drlhp", "policy_shaping", "human")
+    names = ("drlhp", "policy_shaping", "human_expectation")
     flags = ["--env", "line", "--method", *names, "--lam", "1.0", "2.4", "--seeds", "1"]
     assert call([*flags, *tiny_flags(line), "--out", str(tmp_path)]) == 0
     rows = table(tmp_path)
@@ -297,9 +298,9 @@ def test_every_method_with_a_surrogate_reward_has_its_heat_map(tiny):
     rows = []
     for method in ("peps", "sac", "drlhp"):
         config = tiny.replace(method=method)
-        finished = batch.Finished(finish(jax.jit(init)(config), {}, config), evaluation=None, failed=False)
+        finished = batches.Finished(finish(jax.jit(init)(config), {}, config), evaluation=None, failed=False)
         rows += [results.Row(results.Cell("nav-d1", method, 2.4, seed, "any"), finished) for seed in (0, 1)]
-    titles = [axes.get_ylabel() for axes in plots.surrogate_maps(rows).axes]
+    titles = [axes.get_ylabel() for axes in pictures.surrogate_maps(rows).axes]
     assert [title for title in titles if title.startswith("nav")] == ["nav-d1, peps, seed 0", "nav-d1, drlhp, seed 0"]
 
 
@@ -328,7 +329,7 @@ def test_an_interrupted_sweep_keeps_what_is_finished(line, line_task, tmp_path, 
     for name in (results.TABLE, results.PICTURES[0]):
         (tmp_path / name).write_text("an earlier run's")
     (tmp_path / "notes.txt").write_text("mine")
-    compiled, asked = batch.program, []
+    compiled, asked = batches.program, []
 
     def interrupt_the_second(*arguments):
         asked.append(arguments)
@@ -336,7 +337,7 @@ def test_an_interrupted_sweep_keeps_what_is_finished(line, line_task, tmp_path, 
             raise KeyboardInterrupt
         return compiled(*arguments)
 
-    monkeypatch.setattr(batch, "program", interrupt_the_second)
+    monkeypatch.setattr(batches, "program", interrupt_the_second)
     flags = ["--env", "line", "--method", "sac", "peps", "--lam", "1.0", "2.4", "--seeds", "2", "--overwrite"]
     assert call([*flags, *tiny_flags(line), "--out", str(tmp_path)]) == 130
     assert f"4 of 8 cells are finished and kept in {tmp_path}" in capsys.readouterr().err
@@ -353,13 +354,13 @@ def test_an_interrupted_sweep_keeps_what_is_finished(line, line_task, tmp_path, 
 def test_a_cell_alone_in_a_split_batch_and_beside_a_failing_one(line, train):
     cells = [line.replace(method="peps", seed=seed) for seed in (3, 4, 5)]
     cells[1] = cells[1].replace(learning_rate=float("nan"))
-    need = batch.memory_need(cells[0], EPISODES)
+    need = batches.memory_need(cells[0], EPISODES)
     one_per_device = int((memory.bytes_needed(need, 1, together=False) + 100) / memory.AVAILABLE_SHARE)
-    batches = batch.plan(cells, EPISODES, free=one_per_device)
-    assert [one.cells for one in batches] == [(0, 1), (2,)]
+    planned = batches.plan(cells, EPISODES, free=one_per_device)
+    assert [one.cells for one in planned] == [(0, 1), (2,)]
     reported, finished = [], []
 
-    class Listener(batch.Watch):
+    class Listener(batches.Watch):
         def advanced(self, batch, rounds, curves, snapshot):
             reported.append(rounds)
 
@@ -367,7 +368,7 @@ def test_a_cell_alone_in_a_split_batch_and_beside_a_failing_one(line, train):
             finished.extend(cells)
             assert times.run > 0
 
-    batch.run(cells, batches, EPISODES, Listener())
+    batches.run(cells, planned, EPISODES, Listener())
     assert [cell.failed for cell in finished] == [False, True, False]
     assert reported == [1, 2, 3, 4] * 2
 
@@ -386,7 +387,7 @@ def test_a_failed_cell_is_a_row_that_says_so(tiny):
         events={"goal_reached": np.array([True, False])},
         perceived=np.zeros((2, 3, 2)),
     )
-    finished = batch.Finished(result=None, evaluation=evaluation, failed=True)
+    finished = batches.Finished(result=None, evaluation=evaluation, failed=True)
     record = results.record(results.Row(results.Cell("nav-d1", "peps", 2.4, 0, training="x"), finished))
     assert record["status"] == "failed"
     assert record["goal_rate"] == 0.5

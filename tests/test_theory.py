@@ -15,7 +15,8 @@ import peps_envs
 from peps_envs import Discrete, Environment, NextState, Step
 from peps_jax import Config, rollout
 from peps_jax.evaluate import evaluate_policy
-from peps_jax.parts import human, queries, sac, surrogate
+from peps_jax.learning import sac, surrogate
+from peps_jax.preferences import queries, synthetic_human
 
 # --- Eq. (4) --------------------------------------------------------------------------------------------------------------
 
@@ -138,13 +139,13 @@ def taught_by_random_walks(config):
 
     _, walk, _ = rollout.collect(rollout.init(key_actors, config), act, key_act, config)
     pairs = jax.tree.map(lambda rows: rows[: config.num_queries], queries.candidates(walk, key_pairs, config))
-    preferences = human.answer(key_answer, pairs, config)
+    preferences = synthetic_human.answer(key_answer, pairs, config)
     state = surrogate.add(surrogate.init(key_init, config), preferences, 0, key_add, config)
     seen = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), walk)
     steps = seen.transition
     state, _ = surrogate.fit(state, steps, config.num_queries, config.total_steps, key_fit, config)
     environment, _, belief = config.task()
-    weigh = jax.vmap(lambda *step: human.log_weight(environment, belief, *step))
+    weigh = jax.vmap(lambda *step: synthetic_human.log_weight(environment, belief, *step))
     expected, wanted = weigh(seen.state, steps.action, seen.next_state)
     return surrogate.predict(state, steps.observation, steps.action, config), expected, wanted, steps.reward
 

@@ -9,18 +9,10 @@ from conftest import LineParams
 
 import peps_jax
 from peps_jax import grid
-from peps_jax.parts import human
-from peps_jax.parts.human import Teacher
-from peps_jax.parts.trajectory import Preferences
-from peps_jax.train import (
-    annealed_temperature,
-    collect_and_ask,
-    finish,
-    init,
-    learn_and_improve,
-    run_round,
-    run_rounds,
-)
+from peps_jax.preferences import synthetic_human
+from peps_jax.preferences.synthetic_human import Teacher
+from peps_jax.train import annealed_temperature, collect_and_ask, finish, init, learn_and_improve, run_round, run_rounds
+from peps_jax.trajectory import Preferences
 
 CURVES = {"return_", "explicability", "belief_gap", "length", "critic_loss", "policy_entropy", "temperature"}
 LEARNED = {"dynamics_loss", "surrogate_loss", "preference_accuracy"}
@@ -144,7 +136,7 @@ def test_a_host_loop_gives_the_scans_numbers(line, first_state, rounds):
         # the teacher's key is the round's third, as in `run_round`
         key_teacher = jax.random.split(jax.random.fold_in(state.key, index), 5)[2]
         state, queries, collected = collect(state, jnp.asarray(index), line)
-        preferences = jax.jit(human.answer)(key_teacher, queries, line)
+        preferences = jax.jit(synthetic_human.answer)(key_teacher, queries, line)
         state, learned = learn(state, jnp.asarray(index), preferences, line)
         for name, value in (collected | learned).items():
             np.testing.assert_allclose(value, curves[name][index], rtol=1e-3, atol=1e-4, err_msg=name)

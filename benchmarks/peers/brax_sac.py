@@ -1,4 +1,4 @@
-"""Brax's SAC on the JAX world, through `peps_envs.brax_bridge`; see `protocol`."""
+"""Brax's SAC on the JAX world, through `peps_envs.bridges.to_brax`; see `protocol`."""
 
 import functools
 
@@ -6,7 +6,7 @@ import protocol
 from brax.training.agents.sac import networks, train
 
 import peps_envs
-from peps_envs.brax_bridge import BraxEnvironment
+from peps_envs.bridges.to_brax import BraxEnvironment
 
 
 def main() -> None:

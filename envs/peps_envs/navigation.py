@@ -25,7 +25,7 @@ from flax import struct
 from jax import Array
 from jax.scipy.special import log_ndtr, ndtr
 
-from peps_envs.interface import Box, Environment, NextState, Step
+from peps_envs.environment import Box, Environment, NextState, Step
 
 NOWHERE = (-9.0, -9.0, -9.0, -9.0)  # an area that no position is in
 _SLACK = 1e-4  # arena units: a position that was read back from an observation may lie off a face or an edge

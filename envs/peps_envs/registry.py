@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from peps_envs import highway, navigation
-from peps_envs.interface import Environment
+from peps_envs.environment import Environment
 
 
 class Task(NamedTuple):

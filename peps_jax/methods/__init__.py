@@ -6,13 +6,16 @@ import peps_envs
 from peps_envs.registry import unknown_name
 from peps_jax.config import Config
 from peps_jax.methods.drlhp import DRLHP, DRLHP_UNSCALED
-from peps_jax.methods.human import HUMAN
+from peps_jax.methods.human_expectation import HUMAN_EXPECTATION
 from peps_jax.methods.method import Method
 from peps_jax.methods.peps import PEPS, PEPS_ABSOLUTE
 from peps_jax.methods.policy_shaping import POLICY_SHAPING
 from peps_jax.methods.sac import SAC
 
-METHODS = {method.name: method for method in (PEPS, SAC, DRLHP, POLICY_SHAPING, HUMAN, DRLHP_UNSCALED, PEPS_ABSOLUTE)}
+METHODS = {
+    method.name: method
+    for method in (PEPS, SAC, DRLHP, POLICY_SHAPING, HUMAN_EXPECTATION, DRLHP_UNSCALED, PEPS_ABSOLUTE)
+}
 
 
 def get(name: str) -> Method:

@@ -9,10 +9,12 @@ that r-hat keeps the level and the scale that the answers give it.
 
 from __future__ import annotations
 
-from peps_jax.methods import feedback
-from peps_jax.parts.surrogate import Recipe
+from peps_jax.learning.surrogate import Recipe
+from peps_jax.methods import preference_based
 
 RECIPE = Recipe(level="standard", uniform_answers=0.1, validates=True)
 
-DRLHP = feedback.method("drlhp", rewards=(feedback.reward,), recipe=RECIPE)
-DRLHP_UNSCALED = feedback.method("drlhp_unscaled", rewards=(feedback.reward,), recipe=RECIPE._replace(level="none"))
+DRLHP = preference_based.method("drlhp", rewards=(preference_based.reward,), recipe=RECIPE)
+DRLHP_UNSCALED = preference_based.method(
+    "drlhp_unscaled", rewards=(preference_based.reward,), recipe=RECIPE._replace(level="none")
+)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from jax import Array
 
 from peps_jax.config import Config
-from peps_jax.parts.trajectory import Preferences, Segments, Trajectory, Transition
+from peps_jax.trajectory import Preferences, Segments, Trajectory, Transition
 
 
 class Method(NamedTuple):

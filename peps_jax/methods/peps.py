@@ -10,10 +10,10 @@ from flax import struct
 from jax import Array
 
 from peps_jax.config import Config
-from peps_jax.methods import feedback
+from peps_jax.learning import dynamics, surrogate
+from peps_jax.methods import preference_based
 from peps_jax.methods.method import Method, true_world
-from peps_jax.parts import dynamics, surrogate
-from peps_jax.parts.trajectory import Preferences, Transition
+from peps_jax.trajectory import Preferences, Transition
 
 
 @struct.dataclass
@@ -41,7 +41,7 @@ def learn(
     """Lines 4-8 of Algorithm 1: T_A from replay, r_hat from the preferences given so far."""
     key_dynamics, *keys = jax.random.split(key, 3)
     dynamics_state, dynamics_info = dynamics.fit(knowledge.dynamics, buffer, filled, key_dynamics, config)
-    surrogate_state, surrogate_info = feedback.learn(
+    surrogate_state, surrogate_info = preference_based.learn(
         knowledge.surrogate, buffer, filled, preferences, index, tuple(keys), config
     )
     return Knowledge(dynamics=dynamics_state, surrogate=surrogate_state), dynamics_info | surrogate_info
@@ -61,7 +61,7 @@ PEPS = Method(
     uses_lam=True,
     world=true_world,
     init=init,
-    ask=lambda knowledge, trajectory, key, config: feedback.ask(knowledge.surrogate, trajectory, key, config),
+    ask=lambda knowledge, trajectory, key, config: preference_based.ask(knowledge.surrogate, trajectory, key, config),
     learn=learn,
     rewards=(reward,),
     # SAC's own temperature explores; Eq. (6)'s comes on top, so that at lambda = 0 PEPS is SAC

@@ -12,9 +12,9 @@ Two policies that are sure of opposite actions make one that is sure of neither:
 
 from __future__ import annotations
 
-from peps_jax.methods import feedback
+from peps_jax.methods import preference_based
 
-POLICY_SHAPING = feedback.method(
+POLICY_SHAPING = preference_based.method(
     "policy_shaping",
-    rewards=(lambda knowledge, transitions, config: transitions.reward, feedback.reward),
+    rewards=(lambda knowledge, transitions, config: transitions.reward, preference_based.reward),
 )

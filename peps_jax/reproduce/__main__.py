@@ -18,12 +18,13 @@ from typing import NamedTuple
 from peps_envs.registry import unknown_name
 from peps_jax.command_line import Parser, options, refuse, use_every_core
 from peps_jax.config import Config
-from peps_jax.files import NotWrittenError
-from peps_jax.reproduce import driving, figures, tables
+from peps_jax.reproduce import figures, tables
+from peps_jax.reproduce.driving import figure3
+from peps_jax.reproduce.driving.experiment import STEPS
 from peps_jax.reproduce.figures import QUERY_SEEDS
 from peps_jax.reproduce.store import Store
-from peps_jax.reproduce.study import DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
-from peps_jax.study.experiment import STEPS
+from peps_jax.reproduce.trainings import DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
+from peps_jax.storage.files import NotWrittenError
 
 PROG = "python -m peps_jax.reproduce"
 MOST = 1000  # seeds
@@ -45,7 +46,7 @@ RESULTS = {
     "table1": Result("return and explicability of every method", tables.table1_needs, tables.table1),
     "figure1": Result("the learned surrogate reward beside the true one", figures.figure1_needs, figures.figure1),
     "figure2": Result("rollouts of every method", figures.figure2_needs, figures.figure2),
-    "figure3": Result("behaviours and ratings in the driving study", driving.figure3_needs, driving.figure3),
+    "figure3": Result("behaviours and ratings in the driving study", figure3.figure3_needs, figure3.figure3),
     "frontier": Result("return and explicability over lambda", figures.frontier_needs, figures.frontier),
     "queries": Result("explicability over the number of queries", figures.queries_needs, figures.queries),
     "ablations": Result("PEPS and DRLHP without parts of them", tables.ablations_needs, tables.ablations),
@@ -103,7 +104,7 @@ def request(arguments: Sequence[str], base: Config, num_episodes: int) -> Reques
     missing = made.study.missing(wanted, made.store)
     made.study.batches([what for what in missing if isinstance(what, Training)][:1])  # to see, early, that one fits
     if "figure3" in names:
-        driving.check(made.study, made.store.folder)
+        figure3.check(made.study, made.store.folder)
     made.store.open()
     return made
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,12 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import peps_envs
-from peps_jax import files, plots, results
+from peps_jax.analysis.intervals import Estimate
+from peps_jax.analysis.surrogate_maps import rank_correlation
+from peps_jax.drawing.navigation_map import draw_heat, draw_map, draw_route, draw_start
+from peps_jax.drawing.panels import INK, QUIET, colour_of, panels_of, save, tidy
 from peps_jax.reproduce.store import Record
-from peps_jax.reproduce.study import BASELINES, DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
 from peps_jax.reproduce.tables import SCORES, TITLES, Line, interval, with_interval
-from peps_jax.results import markdown
-from peps_jax.statistics import Estimate
+from peps_jax.reproduce.trainings import BASELINES, DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
+from peps_jax.storage import files
+from peps_jax.storage.tables import csv_bytes, markdown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,16 +33,9 @@ REACHED = 0.9  # of the way from SAC's to the planner's explicability: how many 
 
 
 def _save(figure: Figure, lines: Sequence[Line], folder: Path, name: str) -> list[Path]:
-    """Writes name.{png,pdf,csv}."""
-    contents = {f"{name}.csv": results.table(lines)}
-    for kind in ("png", "pdf"):
-        buffer = io.BytesIO()
-        undated = {"CreationDate": None} if kind == "pdf" else None  # the same numbers make the same file
-        figure.savefig(buffer, format=kind, dpi=plots.DOTS, metadata=undated)
-        contents[f"{name}.{kind}"] = buffer.getvalue()
-    for file, content in contents.items():
-        files.write_whole(folder / file, content)
-    return [folder / file for file in contents]
+    """Writes name.{csv,png,pdf}."""
+    files.write_whole(folder / f"{name}.csv", csv_bytes(lines))
+    return [folder / f"{name}.csv", *save(figure, folder, name, ("png", "pdf"))]
 
 
 def _title(domain: str) -> str:
@@ -61,7 +56,7 @@ def figure1_needs(study: Study) -> list[Training | Planned]:
 
 def figure1(study: Study, folder: Path) -> list[Path]:
     """What PEPS learned as r-hat, above the true l_H + r_H: of the seed whose explicability is nearest to the median."""
-    figure, panels = plots.panels_of(2, len(DOMAINS), 3.0, 2.6)
+    figure, panels = panels_of(2, len(DOMAINS), 3.0, 2.6)
     lines = []
     for column, domain in enumerate(DOMAINS):
         training = study.typical(study.trainings(domain, "peps"), _explicability)
@@ -72,14 +67,14 @@ def figure1(study: Study, folder: Path) -> list[Path]:
         params = peps_envs.make(domain).params
         heat = study.record(training).heat
         free = heat["free"]
-        agreement = plots.rank_correlation(heat["learned"][free], heat["true"][free])
+        agreement = rank_correlation(heat["learned"][free], heat["true"][free])
         for axes, name in zip(panels[:, column], ("learned", "true"), strict=True):
-            plots.draw_heat(figure, axes, np.where(free, heat[name], np.nan), params)
-        panels[0, column].set_title(_title(domain), color=plots.INK, fontsize=11)
-        panels[0, column].set_xlabel(f"rank correlation {agreement:.2f}", color=plots.INK, fontsize=8)
+            draw_heat(figure, axes, np.where(free, heat[name], np.nan), params)
+        panels[0, column].set_title(_title(domain), color=INK, fontsize=11)
+        panels[0, column].set_xlabel(f"rank correlation {agreement:.2f}", color=INK, fontsize=8)
         lines += _heat_lines(domain, training.config.seed, heat, np.asarray(params.size))
     for axes, text in zip(panels[:, 0], ("learned r̂", "true ℓ_H + r_H"), strict=True):
-        axes.set_ylabel(text, color=plots.INK, fontsize=10)
+        axes.set_ylabel(text, color=INK, fontsize=10)
     return _save(figure, lines, folder, "figure1")
 
 
@@ -104,12 +99,12 @@ def figure2_needs(study: Study) -> list[Training | Planned]:
 
 def figure2(study: Study, folder: Path) -> list[Path]:
     """Rollouts, a column for each method: one of every seed, and boldly the seed whose explicability is nearest to the median."""
-    figure, panels = plots.panels_of(len(DOMAINS), len(METHODS), 2.1, 2.1)
+    figure, panels = panels_of(len(DOMAINS), len(METHODS), 2.1, 2.1)
     lines = []
     for row, domain in enumerate(DOMAINS):
         params = peps_envs.make(domain).params
         for axes, method in zip(panels[row], METHODS, strict=True):
-            plots.draw_map(axes, params)
+            draw_map(axes, params)
             trainings = study.trainings(domain, method)
             typical = study.typical(trainings, _explicability)
             for training in sorted(trainings, key=lambda training: training is typical):  # the bold one last, on top
@@ -118,15 +113,15 @@ def figure2(study: Study, folder: Path) -> list[Path]:
                     continue
                 route = record.routes[0][: int(record.mode["length"][0]) + 1]
                 bold = training == typical
-                plots.draw_route(axes, route, method, alpha=1.0 if bold else 0.3, width=1.5 if bold else 0.8)
+                draw_route(axes, route, method, alpha=1.0 if bold else 0.3, width=1.5 if bold else 0.8)
                 told = {"domain": domain, "method": method, "seed": training.config.seed, "typical": bold}
                 lines += [
                     told | {"step": step, "x": x, "y": y} for step, (x, y) in enumerate(np.round(route, 4).tolist())
                 ]
-            plots.draw_start(axes, params)
+            draw_start(axes, params)
             if row == 0:
-                axes.set_title(TITLES[method], color=plots.INK, fontsize=11)
-        panels[row, 0].set_ylabel(_title(domain), color=plots.INK, fontsize=11)
+                axes.set_title(TITLES[method], color=INK, fontsize=11)
+        panels[row, 0].set_ylabel(_title(domain), color=INK, fontsize=11)
     return _save(figure, lines, folder, "figure2")
 
 
@@ -152,7 +147,7 @@ def frontier_needs(study: Study) -> list[Training | Planned]:
 
 def frontier(study: Study, folder: Path) -> list[Path]:
     """Explicability against return: the planner's exact curve, PEPS over lambda, and the baselines."""
-    figure, panels = plots.panels_of(1, len(DOMAINS), 3.3, 3.1)
+    figure, panels = panels_of(1, len(DOMAINS), 3.3, 3.1)
     lines = []
     for axes, domain in zip(panels[0], DOMAINS, strict=True):
         own = [_plan_point(study, domain, lam) for lam in _lams(study, PLANNED_LAMS)]
@@ -160,10 +155,10 @@ def frontier(study: Study, folder: Path) -> list[Path]:
         own += [_point(study, domain, method, None) for method in BASELINES]
         own = [point for point in own if np.isfinite(point["return"])]
         _frontier_panel(axes, own)
-        axes.set_title(_title(domain), color=plots.INK, fontsize=11)
-        axes.set_xlabel("return", color=plots.INK, fontsize=9)
+        axes.set_title(_title(domain), color=INK, fontsize=11)
+        axes.set_xlabel("return", color=INK, fontsize=9)
         lines += own
-    panels[0, 0].set_ylabel("explicability", color=plots.INK, fontsize=9)
+    panels[0, 0].set_ylabel("explicability", color=INK, fontsize=9)
     handles = {
         text: handle for axes in panels[0] for handle, text in zip(*axes.get_legend_handles_labels(), strict=True)
     }
@@ -193,7 +188,7 @@ def _estimates(records: Sequence[Record]) -> Line:
 
 def _frontier_panel(axes: Axes, points: Sequence[Line]) -> None:
     """Limits hold the planner's curve and PEPS; what is far below is named at the edge."""
-    plots.tidy(axes)
+    tidy(axes)
     inner = [point for point in points if point["method"] in ("planner", "sac")]
     limits = {}
     for score in SCORES:
@@ -204,7 +199,7 @@ def _frontier_panel(axes: Axes, points: Sequence[Line]) -> None:
     seen = lambda point: all(low <= point[score] <= high for score, (low, high) in limits.items())
     curve = sorted((point for point in points if point["method"] == "planner"), key=lambda point: point["lam"])
     places = np.array([[point[score] for score in SCORES] for point in curve])
-    axes.plot(*places.T, color=plots.QUIET, linewidth=1.2, marker="D", markersize=3.5, label="planner", zorder=2)
+    axes.plot(*places.T, color=QUIET, linewidth=1.2, marker="D", markersize=3.5, label="planner", zorder=2)
     hidden = []
     for method in ("peps", *BASELINES):
         own = [point for point in points if point["method"] == method]
@@ -216,13 +211,13 @@ def _frontier_panel(axes: Axes, points: Sequence[Line]) -> None:
                 [[point[score] - point[f"{score}_low"]], [point[f"{score}_high"] - point[score]]] for score in SCORES
             ]
             axes.errorbar(
-                point["return"], point["explicability"], xerr=spread[0], yerr=spread[1], color=plots.colour_of(method),
+                point["return"], point["explicability"], xerr=spread[0], yerr=spread[1], color=colour_of(method),
                 marker="o", markersize=6, markeredgecolor="white", elinewidth=0.8, linewidth=0, label=label, zorder=3,
             )  # fmt: skip
             label = None
         if method == "peps":
             places = np.array([[point[score] for score in SCORES] for point in visible]).reshape(-1, 2)
-            axes.plot(*places.T, color=plots.colour_of(method), linewidth=1.0, alpha=0.6, zorder=2)
+            axes.plot(*places.T, color=colour_of(method), linewidth=1.0, alpha=0.6, zorder=2)
             sizes = [high - low for low, high in limits.values()]
             for together in _at_one_place(places / sizes):
                 told = ", ".join(f"{visible[number]['lam']:g}" for number in together)
@@ -230,7 +225,7 @@ def _frontier_panel(axes: Axes, points: Sequence[Line]) -> None:
     for number, point in enumerate(hidden):
         lam = f" λ = {point['lam']:g}" if point["lam"] is not None else ""
         text = f"↙ {TITLES[point['method']]}{lam} ({point['return']:.0f}, {point['explicability']:.0f})"
-        colour = plots.colour_of(point["method"])
+        colour = colour_of(point["method"])
         axes.text(0.03, 0.03 + 0.07 * number, text, transform=axes.transAxes, fontsize=7, color=colour)
 
 
@@ -247,7 +242,7 @@ def _at_one_place(places: np.ndarray) -> list[list[int]]:
 
 
 def _note(axes: Axes, text: str, place: Any) -> None:
-    axes.annotate(text, place, (5, 5), textcoords="offset points", fontsize=7, color=plots.INK)
+    axes.annotate(text, place, (5, 5), textcoords="offset points", fontsize=7, color=INK)
 
 
 # --- queries --------------------------------------------------------------------------------------------------------------
@@ -277,13 +272,13 @@ def queries_needs(study: Study) -> list[Training | Planned]:
 
 def queries(study: Study, folder: Path) -> list[Path]:
     """queries.{md,csv,png,pdf}: explicability against the number of queries, a line for each strategy."""
-    figure, panels = plots.panels_of(1, len(QUERY_DOMAINS), 3.3, 2.8)
+    figure, panels = panels_of(1, len(QUERY_DOMAINS), 3.3, 2.8)
     lines = []
     for axes, domain in zip(panels[0], QUERY_DOMAINS, strict=True):
-        plots.tidy(axes)
+        tidy(axes)
         levels = {
-            "planner": (_explicability(study.record(study.planned(domain, "peps"))), plots.INK),
-            "SAC": (_estimates(study.records(_unasked(study, domain)))["explicability"], plots.QUIET),
+            "planner": (_explicability(study.record(study.planned(domain, "peps"))), INK),
+            "SAC": (_estimates(study.records(_unasked(study, domain)))["explicability"], QUIET),
         }
         for name, (level, colour) in levels.items():
             axes.axhline(level, color=colour, linewidth=0.9, linestyle=(0, (4, 3)), label=name)
@@ -305,9 +300,9 @@ def queries(study: Study, folder: Path) -> list[Path]:
         axes.set_xscale("log")
         axes.set_xticks(_budgets(study), [f"{budget:,}" for budget in _budgets(study)])
         axes.minorticks_off()
-        axes.set_title(_title(domain), color=plots.INK, fontsize=11)
-        axes.set_xlabel("queries", color=plots.INK, fontsize=9)
-    panels[0, 0].set_ylabel("explicability", color=plots.INK, fontsize=9)
+        axes.set_title(_title(domain), color=INK, fontsize=11)
+        axes.set_xlabel("queries", color=INK, fontsize=9)
+    panels[0, 0].set_ylabel("explicability", color=INK, fontsize=9)
     handles, texts = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, texts, frameon=False, fontsize=8, loc="outside lower center", ncols=len(texts))
     text = folder / "queries.md"

@@ -9,27 +9,23 @@ A folder holds one configuration. Another one's trainings, or those of other cod
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-import peps_envs
-from peps_jax import files, results
 from peps_jax.config import Config
 from peps_jax.evaluate import Evaluation
+from peps_jax.execution import machine
+from peps_jax.storage import code, files
+from peps_jax.storage.arrays import read_arrays, write_arrays
 
 HEAD, CELLS = "reproduce.json", "cells"
 ROUTES = 3  # episodes of each training whose route is kept
-# what decides a training's numbers beside its settings: files and folders beside a module of each package
-CODE = {
-    results: ("parts", "methods", "train.py", "rollout.py", "evaluate.py", "explicability.py", "planner.py"),
-    peps_envs: ("navigation.py",),
-}
+# modules whose code, and that of all they import, decides a record's numbers beside its settings
+CODE = ("peps_jax.train", "peps_jax.evaluate", "peps_jax.analysis.navigation_planner")
 
 
 class Record(NamedTuple):
@@ -62,7 +58,7 @@ def episodes(evaluation: Evaluation) -> dict[str, np.ndarray]:
 
 def settings_of(config: Config) -> dict[str, Any]:
     """Every setting, as JSON knows it."""
-    return results.plain({field.name: getattr(config, field.name) for field in dataclasses.fields(Config)})
+    return files.plain({field.name: getattr(config, field.name) for field in dataclasses.fields(Config)})
 
 
 def digest(*parts: Any) -> str:
@@ -72,31 +68,7 @@ def digest(*parts: Any) -> str:
 
 def code_digest() -> str:
     """A short name for the code that trains, evaluates and plans."""
-    return digest([files.sources(Path(module.__file__).parent, names) for module, names in CODE.items()])
-
-
-def write_arrays(path: Path, digest: str, arrays: Mapping[str, Any]) -> None:
-    """Keeps arrays, and the digest of what made them."""
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, digest=np.array(digest), **arrays)
-    files.write_whole(path, buffer.getvalue())
-
-
-def read_arrays(path: Path, digest: str, made_by: str = "settings") -> dict[str, np.ndarray]:
-    """What `write_arrays` was given.
-
-    Raises:
-      ValueError: it can't be read, or something with another digest made it: other `made_by`.
-    """
-    try:
-        with np.load(io.BytesIO(path.read_bytes())) as file:
-            arrays = dict(file)
-        found = str(arrays.pop("digest"))
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
-        raise ValueError(f"file {str(path)!r} can't be read: remove it, and it is made again") from None
-    if found != digest:
-        raise ValueError(f"file {str(path)!r} was made with other {made_by}: choose another folder")
-    return arrays
+    return code.digest(*CODE)[:16]
 
 
 class Store:
@@ -145,7 +117,7 @@ class Store:
             raise ValueError(
                 f"out {str(self.folder)!r} can't be made: {error.strerror}; choose another folder"
             ) from None
-        head = self._head | results.machine()
+        head = self._head | machine.describe()
         files.write_whole(self.folder / HEAD, files.json_bytes(head))
 
     def _path(self, name: str) -> Path:

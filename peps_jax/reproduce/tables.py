@@ -14,16 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from peps_jax import files, results
+from peps_jax.analysis.intervals import Estimate, estimate, interquartile_mean, probability_of_improvement
 from peps_jax.config import Config
+from peps_jax.reproduce.driving import report
 from peps_jax.reproduce.store import Record
-from peps_jax.reproduce.study import BASELINES, DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
-from peps_jax.results import markdown
-from peps_jax.statistics import Estimate, estimate, interquartile_mean, probability_of_improvement
-from peps_jax.study import report
+from peps_jax.reproduce.trainings import BASELINES, DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
+from peps_jax.storage import files
+from peps_jax.storage.tables import csv_bytes, markdown
 
 SCORES = ("return", "explicability")
-TITLES = report.TITLES | {"human": "human"}
+TITLES = report.TITLES | {"human_expectation": "human"}
 # Gong and Zhang 2021, Table 1, in the order of `DOMAINS`: averages over 100 rollouts, without intervals
 PAPER = {
     "return": {
@@ -193,9 +193,9 @@ def table1(study: Study, folder: Path) -> list[Path]:
     ]
     contents = {
         "table1.md": "\n".join(text),
-        "table1.csv": results.table(lines),
+        "table1.csv": csv_bytes(lines),
         "table1.tex": latex(_head(paper=True), shown),
-        "improvement.csv": results.table(improvements),
+        "improvement.csv": csv_bytes(improvements),
     }
     return _write(folder, contents)
 
@@ -273,7 +273,7 @@ def ablations(study: Study, folder: Path) -> list[Path]:
     shown = [_cells(made, paper=False) for made in lines]
     contents = {
         "ablations.md": markdown(_head(paper=False), shown),
-        "ablations.csv": results.table(lines),
+        "ablations.csv": csv_bytes(lines),
         "ablations.tex": latex(_head(paper=False), shown),
     }
     return _write(folder, contents)

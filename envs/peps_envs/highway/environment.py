@@ -22,11 +22,11 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from peps_envs.environment import Discrete, Environment, NextState, Step
 from peps_envs.highway import classic, traffic, vehicle
 from peps_envs.highway.simulation import Physics, Road, advance
 from peps_envs.highway.traffic import Drivers
 from peps_envs.highway.vehicle import LANE_WIDTH, LENGTH, WIDTH, Vehicles
-from peps_envs.interface import Discrete, Environment, NextState, Step
 
 START = 100.0  # m, where the ego starts
 CUT = 2.0  # standard deviations at which the friction coefficient's distribution is clipped

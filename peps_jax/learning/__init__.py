@@ -1,0 +1,1 @@
+"""What is learned: networks, replay, the dynamics T_A, the surrogate reward r-hat, and soft actor-critic."""

@@ -1,0 +1,1 @@
+"""Queries, who answers them, and the answers."""

@@ -1,0 +1,93 @@
+"""Queries: which pairs of segments the teacher is asked to compare.
+
+Candidates are cut from the latest trajectories. The information that an answer brings about r-hat is the mutual information
+between the answer and the ensemble's members (Biyik et al. 2019),
+
+    gain = H(mean_k p_k) - mean_k H(p_k),    p_k = P(first preferred) by member k,
+
+0 where the members agree and at most log 2. Of the most informative candidates a varied batch is taken.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from peps_jax.config import Config
+from peps_jax.trajectory import Segments, Trajectory
+
+
+def candidates(trajectory: Trajectory, key: Array, config: Config) -> Segments:
+    """Pairs of segments from `trajectory` (steps, num_envs, ...): (queries_per_round * candidates_per_query, 2, steps, ...).
+
+    Starts and environments are uniform, lengths uniform from `min_segment_length` to `segment_length`; a segment ends earlier
+    where its episode does.
+    """
+    steps, num_envs = trajectory.truncated.shape
+    shape = (config.queries_per_round * config.candidates_per_query, 2)
+    key_env, key_start, key_length = jax.random.split(key, 3)
+    env = jax.random.randint(key_env, shape, 0, num_envs)[..., None]
+    start = jax.random.randint(key_start, shape, 0, steps - config.segment_length + 1)[..., None]
+    length = jax.random.randint(key_length, shape, config.min_segment_length, config.segment_length + 1)[..., None]
+    offset = jnp.arange(config.segment_length)[None, None]
+    cut = jax.tree.map(lambda rows: rows[start + offset, env], trajectory)
+    over = jnp.maximum(cut.transition.terminated, cut.truncated.astype(jnp.float32))
+    ended_before = jnp.cumsum(over, -1) - over > 0
+    return Segments(
+        observation=cut.transition.observation,
+        action=cut.transition.action,
+        mask=jnp.where((offset < length) & ~ended_before, 1.0, 0.0),
+        state=cut.state,
+        next_state=cut.next_state,
+    )
+
+
+def _binary_entropy(probability: Array) -> Array:
+    return -jax.scipy.special.xlogy(probability, probability) - jax.scipy.special.xlog1py(1 - probability, -probability)
+
+
+def information_gain(logits: Array) -> Array:
+    """Mutual information, in nats, between the answer and the member: (n,) from the members' logits (members, n)."""
+    probability = jax.nn.sigmoid(logits)
+    return jnp.maximum(_binary_entropy(jnp.mean(probability, 0)) - jnp.mean(_binary_entropy(probability), 0), 0.0)
+
+
+def disagreement(logits: Array) -> Array:
+    """Variance of the members' probabilities (Christiano et al. 2017): (n,) from logits (members, n)."""
+    return jnp.var(jax.nn.sigmoid(logits), 0)
+
+
+def choose(logits: Array, descriptions: Array, key: Array, config: Config) -> Array:
+    """Indices (queries_per_round,) of the candidates to ask, best first, without near-duplicates.
+
+    Args:
+      logits: (members, candidates) of the first segment being preferred.
+      descriptions: (candidates, n) of each pair; a pair near an already chosen one counts for less,
+        1 - exp(-(distance / typical distance)^2).
+    """
+    score = {
+        "information_gain": lambda: information_gain(logits) + 1e-9,
+        "disagreement": lambda: disagreement(logits) + 1e-9,
+        "random": lambda: jax.random.uniform(key, logits.shape[1:], minval=1e-3),
+    }[config.query_strategy]()
+    # mean squared distance of two candidates
+    typical = 2 * jnp.mean(jnp.var(descriptions, 0)) * descriptions.shape[1] + 1e-6
+
+    def take(score: Array, _: None) -> tuple[Array, Array]:
+        best = jnp.argmax(score)
+        squared = jnp.sum((descriptions - descriptions[best][None]) ** 2, -1)
+        # a tenth of the typical distance counts as near; the chosen one itself gets 0 and is never taken twice
+        return score * -jnp.expm1(-100 * squared / typical), best
+
+    _, chosen = jax.lax.scan(take, score, None, config.queries_per_round)
+    return chosen
+
+
+def describe(segments: Segments) -> Array:
+    """(candidates, n): where each of a pair's segments begins and ends, and how long it is; what `choose` compares."""
+    length = jnp.sum(segments.mask, -1)
+    last = jnp.maximum(length - 1, 0).astype(jnp.int32)
+    ends = jnp.take_along_axis(segments.observation, last[..., None, None], -2)[..., 0, :]
+    parts = jnp.concatenate([segments.observation[..., 0, :], ends, length[..., None] / segments.mask.shape[-1]], -1)
+    return parts.reshape(parts.shape[0], -1)

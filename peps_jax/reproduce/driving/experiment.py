@@ -1,0 +1,192 @@
+"""The experiment: agents learn from the training group's answers, drive in the rain, and are rated."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from peps_jax import methods
+from peps_jax.config import Config
+from peps_jax.execution import batches
+from peps_jax.learning import surrogate
+from peps_jax.reproduce.driving.comparisons import ANSWERS, TRAINERS, compare
+from peps_jax.reproduce.driving.ratings import GROUPS, Group, groups
+from peps_jax.reproduce.driving.scenes import BEHAVIOURS, HORIZON, RAIN, behaviour, crashed, road, watch_agent
+from peps_jax.train import Result, TrainingState, check, collect_and_ask, finish, improve, init
+from peps_jax.trajectory import Preferences, Segments
+
+METHODS = ("peps", "sac", "drlhp", "policy_shaping")
+RATED = METHODS[:3]  # by the paper's participants. A rating says how a scene compares with the others that a rater saw
+STEPS, EPISODES = 30_000, 100  # environment steps of a training, and scenes in which it is seen
+FEW_SEEDS = 3  # at each lambda beside the study's own
+
+# A scene pays about 7, where a way through navigation's maze pays about 100: entropies weigh less, rewards needn't be scaled.
+SETTINGS = dict(
+    lam=2.0, gamma=0.99, num_envs=16, rollout_length=24, warmup_steps=1_920, updates_per_step=0.5,
+    hold_steps=2, reward_scale=0.25, policy_entropy_weight=0.02, initial_temperature=2.0, temperature=0.01,
+    segment_length=HORIZON, num_queries=TRAINERS * ANSWERS, surrogate_learning_rate=2e-3,
+)  # fmt: skip
+LAMS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)  # over which PEPS is shown
+
+
+def settings(method: str, seed: int, steps: int = STEPS, **changes: Any) -> Config:
+    """The training of one agent, in the rain."""
+    return road(RAIN, method=method, total_steps=steps, **(SETTINGS | changes)).replace(seed=seed)
+
+
+def taught(config: Config, given: Preferences) -> Result:
+    """A training whose teacher has said everything before it begins: r-hat is fitted to all of `given` from the first round on.
+
+    What the method would ask in a round is not asked: which pairs are compared was chosen beforehand.
+    """
+    check(config)
+    method, state = methods.get(config.method), init(config)
+    key_add, key_rounds = jax.random.split(jax.random.fold_in(state.key, config.num_rounds))
+    share, last = config.queries_per_round, config.num_rounds - 1
+    blank = share * config.num_rounds - given.answers.shape[0]  # rows that the last round's share has too many
+    rows = jax.tree.map(lambda rows: jnp.pad(rows, [(0, blank)] + [(0, 0)] * (rows.ndim - 1)), given)
+    latest = jax.tree.map(lambda rows: rows[last * share :], rows)
+    if hasattr(state.knowledge, "surrogate"):
+        told = surrogate.add(state.knowledge.surrogate, rows, 0, key_add, config)
+        state = state.replace(knowledge=state.knowledge.replace(surrogate=told))
+
+    def one_round(state: TrainingState, index: Array) -> tuple[TrainingState, dict[str, Array]]:
+        state, _, collected = collect_and_ask(state, index, config)
+        key_learn, key_improve = jax.random.split(jax.random.fold_in(key_rounds, index))
+        filled = (index + 1) * config.steps_per_round
+        knowledge, learned = method.learn(
+            state.knowledge, state.replay, filled, latest, jnp.asarray(last), key_learn, config
+        )
+        state = state.replace(knowledge=knowledge)
+        agents, improved = improve(state, index, key_improve, config)
+        return state.replace(agents=agents), collected | learned | improved
+
+    return finish(*jax.lax.scan(one_round, state, jnp.arange(config.num_rounds)), config)
+
+
+class Seen(NamedTuple):
+    """What is seen of one agent in the rain."""
+
+    scenes: Segments  # (episodes, HORIZON, ...)
+    kind: Array  # (episodes,) place in `BEHAVIOURS`
+    crashed: Array  # (episodes,) bool
+    return_: Array  # (episodes,) sum of r_A
+    finite: Array  # () bool: what was learned is
+
+
+def learn(config: Config, episodes: int) -> Seen:
+    """One agent, taught by a group of its own, in the rain."""
+    key_group, key_watch = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1))
+    result = taught(config, compare(key_group))
+    scenes = watch_agent(result, key_watch, episodes)
+    environment, params, _ = config.task()
+    reward = jax.vmap(jax.vmap(environment.reward, (0, 0, 0, None)), (0, 0, 0, None))
+    rewards = reward(scenes.state, scenes.action, scenes.next_state, params)
+    leaves = jax.tree.leaves((result.agents, result.knowledge))
+    learned = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return Seen(
+        scenes=scenes,
+        kind=behaviour(scenes),
+        crashed=crashed(scenes),
+        return_=jnp.sum(rewards * scenes.mask, -1),
+        finite=jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in learned])),
+    )
+
+
+class Part(NamedTuple):
+    """Agents that are trained by one program: one method's, for every lambda and seed."""
+
+    method: str
+    lams: tuple[float, ...]
+    seeds: tuple[int, ...]
+    steps: int
+    episodes: int
+
+    @property
+    def name(self) -> str:
+        return self.method if self.lams == (SETTINGS["lam"],) else f"{self.method} over lambda"
+
+    @property
+    def configs(self) -> list[Config]:
+        return [settings(self.method, seed, self.steps, lam=lam) for lam in self.lams for seed in self.seeds]
+
+
+def parts(
+    seeds: Sequence[int], steps: int = STEPS, lams: Iterable[float] = LAMS, names: Sequence[str] | None = None
+) -> list[Part]:
+    """What the study trains: methods `names`, all by default, and PEPS at the `lams` beside its own with fewer seeds."""
+    own = SETTINGS["lam"]
+    made = [Part(method, (own,), tuple(seeds), steps, EPISODES) for method in (METHODS if names is None else names)]
+    others = tuple(lam for lam in lams if lam != own)
+    return made + [Part("peps", others, tuple(seeds[:FEW_SEEDS]), steps, EPISODES)] * bool(others)
+
+
+def run_part(part: Part) -> Seen:
+    """Trains and watches its agents over all devices: numpy arrays, (lams, seeds, ...)."""
+    print(f"training {part.name}: {len(part.configs)} agents", file=sys.stderr, flush=True)
+    program, cells = batches.compile_over_devices(lambda config: learn(config, part.episodes), part.configs)
+    number, shape = len(part.configs), (len(part.lams), len(part.seeds))
+    shaped = lambda rows: np.asarray(rows)[:number].reshape(*shape, *rows.shape[1:])
+    return jax.tree.map(shaped, program(cells))
+
+
+class Conduct(NamedTuple):
+    """How the agents of one method behave, with a number or a row for each seed that didn't fail."""
+
+    shares: list[list[float]]  # of scenes with each of `BEHAVIOURS`
+    crash_rate: list[float]
+    return_: list[float]  # mean sum of r_A
+    failed: int  # seeds whose agent isn't finite
+
+    def seeds_that(self, kind: int) -> int:
+        """How many seeds show a behaviour in most scenes."""
+        return sum(int(np.argmax(shares)) == kind for shares in self.shares)
+
+
+def conduct(seen: Seen) -> Conduct:
+    """Of `seen` (seeds, ...)."""
+    good = np.flatnonzero(seen.finite)
+    shares = np.stack([np.mean(seen.kind[good] == kind, 1) for kind in range(len(BEHAVIOURS))], 1)
+    mean = lambda rows: np.mean(rows[good], 1).tolist()
+    return Conduct(shares.tolist(), mean(seen.crashed), mean(seen.return_), len(seen.finite) - len(good))
+
+
+class Findings(NamedTuple):
+    """What the study found."""
+
+    scenes: dict[str, Segments]  # by method, at the study's own lambda: (seeds * episodes, HORIZON, ...)
+    conduct: dict[str, Conduct]  # by method
+    over_lam: dict[float, Conduct]  # of PEPS
+    groups: list[Group]  # of raters, who see what the paper's saw; the first is the study's own
+    wider: list[Group]  # the same raters after they have seen every method; none if that is no more
+
+
+Make = Callable[[Part], Seen]  # trains a part's agents, or takes them from where they were kept
+
+
+def run(wanted: Sequence[Part], number: int = GROUPS, make: Make = run_part) -> Findings:
+    """The whole study: labels, agents, and `number` groups of raters."""
+    scenes, conducts, over_lam = {}, {}, {}
+    for part in wanted:
+        seen = make(part)
+        for place, lam in enumerate(part.lams):
+            found = conduct(jax.tree.map(lambda rows: rows[place], seen))  # noqa: B023, used at once
+            if part.method == "peps":
+                over_lam[lam] = found
+            if lam == SETTINGS["lam"]:
+                conducts[part.method] = found
+                good = np.flatnonzero(seen.finite[place])
+                pool = lambda rows: rows[place, good].reshape(-1, *rows.shape[3:])  # noqa: B023
+                scenes[part.method] = jax.tree.map(pool, seen.scenes)
+    print(f"{number} groups of raters", file=sys.stderr, flush=True)
+    key = jax.random.fold_in(jax.random.key(wanted[0].seeds[0]), 2)
+    papers = {method: shown for method, shown in scenes.items() if method in RATED}
+    wider = groups(key, scenes, road(RAIN), number) if len(scenes) > len(papers) else []
+    rated = groups(key, papers, road(RAIN), number)
+    return Findings(scenes, conducts, dict(sorted(over_lam.items())), rated, wider)

@@ -1,0 +1,192 @@
+"""Which trainings and plans an evaluation is made of, and how those that are missing are made.
+
+A training is named for its world, its method, what it changes of the study's settings, and its seed: tables and figures that
+ask for the same one share it.
+"""
+
+from __future__ import annotations
+
+import functools
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+import peps_envs
+from peps_jax.analysis import navigation_planner
+from peps_jax.analysis.surrogate_maps import surrogate_values
+from peps_jax.config import Config
+from peps_jax.evaluate import Evaluation, evaluate
+from peps_jax.execution import batches
+from peps_jax.execution.progress import Display
+from peps_jax.reproduce.store import ROUTES, Record, Store, episodes, settings_of
+from peps_jax.train import Result, check
+
+DOMAINS = ("nav-d1", "nav-d2", "nav-d3", "nav-d4")
+METHODS = ("peps", "sac", "drlhp", "policy_shaping", "human_expectation")  # Table 1's, and the human's expectation
+BASELINES = ("sac", "drlhp", "policy_shaping")
+FEW_SEEDS = 3  # of what is beside Table 1 and the figures of its trainings
+# of the planner, for each objective: noise acts in the believed world alone, and there a few points would miss its tails
+PLANNER = {
+    "return": dict(points=1, resolution=121),
+    "peps": dict(points=1, resolution=121),
+    "human": dict(points=7, resolution=61),
+}
+
+
+class Training(NamedTuple):
+    """A training by its name."""
+
+    name: str
+    config: Config
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """What decides its numbers."""
+        return settings_of(self.config)
+
+
+class Planned(NamedTuple):
+    """A plan of the known-model planner; lambda matters to "peps" alone."""
+
+    env: str
+    objective: str
+    lam: float
+    gamma: float
+
+    @property
+    def name(self) -> str:
+        return f"{self.env}-planner-{self.objective}" + f"-lam{self.lam:g}" * (self.objective == "peps")
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """What decides its numbers."""
+        return self._asdict() | PLANNER[self.objective]
+
+
+Score = Callable[[Record], float]
+
+
+class Study:
+    """A base configuration, a number of seeds, and the records so far."""
+
+    def __init__(self, base: Config, seeds: int, num_episodes: int):
+        self.base, self.seeds, self.num_episodes = base, seeds, num_episodes
+        self._records: dict[str, Record] = {}
+
+    def training(self, env: str, method: str, seed: int, **changes: Any) -> Training:
+        """The training of `method` in `env` with `changes` of the study's settings; changes that change nothing don't count."""
+        changes = {name: value for name, value in changes.items() if getattr(self.base, name) != value}
+        told = "".join(f"-{name}-{value}" for name, value in changes.items())
+        config = self.base.replace(env=env, method=method, seed=seed, **changes)
+        return Training(f"{env}-{method}{told}-seed{seed}", config)
+
+    def trainings(self, env: str, method: str, seeds: int | None = None, **changes: Any) -> list[Training]:
+        """The trainings of the first `seeds` seeds; of all by default."""
+        number = self.seeds if seeds is None else min(seeds, self.seeds)
+        return [self.training(env, method, seed, **changes) for seed in range(number)]
+
+    def planned(self, env: str, objective: str, lam: float | None = None) -> Planned:
+        """A plan, at the study's lambda by default."""
+        lam = self.base.lam if lam is None or objective != "peps" else lam
+        return Planned(env, objective, float(lam), float(self.base.gamma))
+
+    def record(self, what: Training | Planned) -> Record:
+        return self._records[what.name]
+
+    def records(self, trainings: Iterable[Training]) -> list[Record]:
+        """Records of those `trainings` that didn't fail."""
+        return [record for record in map(self.record, trainings) if not record.failed]
+
+    def typical(self, trainings: Sequence[Training], score: Score) -> Training | None:
+        """Of those that didn't fail, the one whose score is nearest to their median."""
+        good = [training for training in trainings if not self.record(training).failed]
+        middle = np.median([score(self.record(training)) for training in good]) if good else 0.0
+        return min(good, key=lambda training: abs(score(self.record(training)) - middle), default=None)
+
+    def missing(self, wanted: Sequence[Training | Planned], store: Store) -> list[Training | Planned]:
+        """Takes in what `store` has of `wanted`; returns the rest, each once.
+
+        Raises:
+          ValueError: settings that make no sense, or a file that doesn't fit.
+        """
+        rest = {}
+        for what in wanted:
+            if isinstance(what, Training):
+                check(what.config)
+            if what.name not in self._records:
+                record = store.load(what.name, what.recipe)
+                if record is None:
+                    rest[what.name] = what
+                else:
+                    self._records[what.name] = record
+        return list(rest.values())
+
+    def batches(self, trainings: Sequence[Training]) -> list[batches.Batch]:
+        """How `trainings` are divided. Raises OutOfMemoryError, a ValueError, if one doesn't fit."""
+        configs = [training.config for training in trainings]
+        return batches.plan(configs, self.num_episodes, most=batches.cells_soon_done(jax.devices()))
+
+    def make(self, missing: Sequence[Training | Planned], store: Store) -> None:
+        """Plans and trains what is missing; each batch is kept as soon as it is done."""
+
+        def keep(what: Training | Planned, record: Record) -> None:
+            store.save(what.name, what.recipe, record)
+            self._records[what.name] = record
+
+        plans = [what for what in missing if isinstance(what, Planned)]
+        for number, planned in enumerate(plans, 1):
+            print(f"planning {planned.name}, {number} of {len(plans)}", file=sys.stderr, flush=True)
+            keep(planned, _plan(planned, self.num_episodes))
+        trainings = [what for what in missing if isinstance(what, Training)]
+
+        def keep_batch(done: batches.Batch, finished: Sequence[batches.Finished], times: batches.Times) -> None:
+            seconds = (times.run + times.evaluate) / len(done.cells)
+            for place, cell in zip(done.cells, finished, strict=True):
+                keep(trainings[place], _reduce(cell, self.num_episodes, seconds))
+
+        if trainings:
+            configs = [training.config for training in trainings]
+            divided = self.batches(trainings)
+            with Display(configs, divided, keep_batch) as display:
+                batches.run(configs, divided, self.num_episodes, display)
+
+
+def _reduce(cell: batches.Finished, num_episodes: int, seconds: float) -> Record:
+    """What is kept of a finished training, its samples' evaluation and r-hat over the map among it."""
+    # the task's numbers in place of names: every world shares these programs
+    result = cell.result.replace(config=batches.shared(cell.result.config), curves={})
+    heat = {}
+    if hasattr(result.knowledge, "surrogate"):
+        heat = dict(zip(("learned", "true", "free"), surrogate_values(result), strict=True))
+    return Record(
+        mode=episodes(cell.evaluation),
+        sampled=episodes(_evaluate_samples(result, num_episodes)),
+        routes=np.asarray(cell.evaluation.perceived[:ROUTES]),
+        heat=heat,
+        failed=cell.failed,
+        seconds=seconds,
+    )
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _evaluate_samples(result: Result, num_episodes: int) -> Evaluation:
+    return evaluate(result, result.config, num_episodes, stochastic=True)
+
+
+def _plan(planned: Planned, num_episodes: int) -> Record:
+    start = time.perf_counter()
+    task = peps_envs.make(planned.env)
+    belief = task.beliefs[task.default_belief]
+    asked = task.environment, task.params, belief, planned.objective, planned.lam, num_episodes
+    evaluation = jax.device_get(_plan_and_walk(*asked, gamma=planned.gamma, **PLANNER[planned.objective]))
+    routes = evaluation.perceived[:ROUTES]
+    return Record(episodes(evaluation), {}, routes, {}, failed=False, seconds=time.perf_counter() - start)
+
+
+_plan_and_walk = jax.jit(
+    navigation_planner.walk, static_argnames=("environment", "objective", "num_episodes", "points", "resolution")
+)

@@ -1,0 +1,1 @@
+"""Sweeps over environments, methods, lambdas and seeds: `python -m peps_jax.sweep`."""

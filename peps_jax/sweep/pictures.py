@@ -1,0 +1,217 @@
+"""Pictures of a sweep, from its finished rows. matplotlib is imported on the first one drawn.
+
+Each function makes one figure, or returns None where it has nothing to show; `draw` writes all of them into a folder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from peps_envs.navigation import Navigation
+from peps_jax import methods
+from peps_jax.analysis.surrogate_maps import rank_correlation, surrogate_values
+from peps_jax.drawing.navigation_map import draw_heat, draw_map, draw_route, draw_start
+from peps_jax.drawing.panels import INK, QUIET, colour_of, panels_of, save, tidy
+from peps_jax.sweep.results import PICTURES, Row
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def _good(rows: Sequence[Row]) -> list[Row]:
+    return [row for row in rows if not row.finished.failed]
+
+
+def _values(rows: Sequence[Row], key: Callable[[Row], Any]) -> list[Any]:
+    return list(dict.fromkeys(key(row) for row in rows))
+
+
+def _middle_lam(rows: Sequence[Row]) -> float:
+    """One lambda stands for a grid of them where there is room for one: the middle of those that were swept."""
+    lams = sorted({row.cell.lam for row in rows})
+    return lams[len(lams) // 2]
+
+
+def _of_method(rows: Sequence[Row], env: str, method: str, lam: float) -> list[Row]:
+    return [row for row in rows if (row.cell.env, row.cell.method, row.cell.lam) == (env, method, lam)]
+
+
+# --- curves ---------------------------------------------------------------------------------------------------------------
+
+
+def _smooth(values: np.ndarray, width: int) -> np.ndarray:
+    """Mean over the last `width` rounds (rounds,); nan where no episode ended in any of them."""
+    seen = np.isfinite(values)
+    recent = lambda numbers: np.convolve(numbers, np.ones(width))[: len(numbers)]
+    count = recent(seen.astype(float))
+    return np.where(count > 0.5, recent(np.where(seen, values, 0.0)) / np.maximum(count, 1), np.nan)
+
+
+def learning_curves(rows: Sequence[Row]) -> Figure | None:
+    """Return and explicability of the episodes that ended, over environment steps: mean and range over seeds."""
+    rows = _good(rows)
+    if not rows:
+        return None
+    envs, lam = _values(rows, lambda row: row.cell.env), _middle_lam(rows)
+    figure, panels = panels_of(2, len(envs), 3.6, 2.3)
+    for column, env in enumerate(envs):
+        for line, (curve, title) in enumerate((("return_", "return"), ("explicability", "explicability"))):
+            axes = panels[line, column]
+            tidy(axes)
+            shown = []
+            for method in _values(rows, lambda row: row.cell.method):
+                members = _of_method(rows, env, method, lam)
+                if members:
+                    shown.append(_curve(axes, members, curve))
+            shown = np.concatenate(shown)
+            if shown.size:  # the first, random rounds may be far below all that follows
+                bottom = max(axes.get_ylim()[0], shown.min() - 0.25 * (np.ptp(shown) + 10))
+                axes.set_ylim(bottom, shown.max() + 0.08 * (shown.max() - bottom) + 1e-6)
+            else:
+                axes.text(0.5, 0.5, "no episode ended", transform=axes.transAxes, ha="center", color=QUIET, fontsize=8)
+            if line == 0:
+                axes.set_title(env, color=INK, fontsize=11)
+            else:
+                axes.set_xlabel("environment steps (thousands)", color=INK, fontsize=9)
+            if column == 0:
+                axes.set_ylabel(title, color=INK, fontsize=9)
+    panels[0, 0].legend(frameon=False, fontsize=8, loc="lower right")
+    return figure
+
+
+def _curve(axes: Axes, members: Sequence[Row], curve: str) -> np.ndarray:
+    """One method's line and band; returns the line without its first fifth."""
+    config = members[0].finished.result.config
+    width = max(1, config.num_rounds // 15)
+    seeds = np.stack([_smooth(row.finished.result.curves[curve], width) for row in members])
+    places = np.flatnonzero(np.isfinite(seeds).any(0))
+    mean, low, high = (reduce(seeds[:, places], 0) for reduce in (np.nanmean, np.nanmin, np.nanmax))
+    steps = (places + 1) * config.steps_per_round / 1000
+    colour = colour_of(members[0].cell.method)
+    axes.fill_between(steps, low, high, color=colour, alpha=0.16, linewidth=0)
+    axes.plot(steps, mean, color=colour, linewidth=1.8, label=_label(members[0].cell.method, members[0].cell.lam))
+    return mean[len(mean) // 5 :]
+
+
+def _label(method: str, lam: float) -> str:
+    return f"{method}, λ = {lam:g}" if methods.get(method).uses_lam else method
+
+
+def frontier(rows: Sequence[Row]) -> Figure | None:
+    """Explicability against return, a point for each lambda: mean and standard deviation over seeds, and the seeds themselves."""
+    rows = _good(rows)
+    if not rows:
+        return None
+    envs = _values(rows, lambda row: row.cell.env)
+    figure, panels = panels_of(1, len(envs), 3.6, 3.1)
+    for axes, env in zip(panels[0], envs, strict=True):
+        tidy(axes)
+        for method in _values(rows, lambda row: row.cell.method):
+            lams = _values(
+                [row for row in rows if (row.cell.env, row.cell.method) == (env, method)], lambda row: row.cell.lam
+            )
+            if not methods.get(method).uses_lam:
+                lams = lams[:1]  # all rows are the same trainings
+            _frontier_line(axes, [_of_method(rows, env, method, lam) for lam in sorted(lams)], method)
+        axes.margins(0.15)
+        axes.set_title(env, color=INK, fontsize=11)
+        axes.set_xlabel("return", color=INK, fontsize=9)
+    panels[0, 0].set_ylabel("explicability", color=INK, fontsize=9)
+    panels[0, 0].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _frontier_line(axes: Axes, points: Sequence[Sequence[Row]], method: str) -> None:
+    """One method's points, in the order of lambda, joined by a line."""
+    if not points:
+        return
+    score = lambda row: (np.mean(row.finished.evaluation.return_), np.mean(row.finished.evaluation.explicability))
+    seeds = [np.array([score(row) for row in members]) for members in points]
+    means, spreads = np.array([s.mean(0) for s in seeds]), np.array([s.std(0) for s in seeds])
+    colour = colour_of(method)
+    axes.scatter(*np.concatenate(seeds).T, s=9, color=colour, alpha=0.3, linewidth=0, zorder=2)
+    axes.errorbar(
+        *means.T, xerr=spreads[:, 0], yerr=spreads[:, 1], color=colour, linewidth=1.2, elinewidth=0.8, marker="o",
+        markersize=6, markeredgecolor="white", label=method, zorder=3,
+    )  # fmt: skip
+    if methods.get(method).uses_lam:
+        for members, place in zip(points, means, strict=True):
+            name = f"λ = {members[0].cell.lam:g}"
+            axes.annotate(name, place, (0, 7), textcoords="offset points", ha="center", fontsize=7, color=INK)
+
+
+# --- maps -----------------------------------------------------------------------------------------------------------------
+
+
+def _navigates(row: Row) -> bool:
+    return isinstance(row.finished.result.config.task()[0], Navigation)
+
+
+def routes(rows: Sequence[Row], episodes: int = 3) -> Figure | None:
+    """Evaluation routes on the map, a column for each method and lambda: the first `episodes` of every seed."""
+    rows = [row for row in _good(rows) if _navigates(row)]
+    if not rows:
+        return None
+    variant = lambda row: (row.cell.method, row.cell.lam if methods.get(row.cell.method).uses_lam else None)
+    variants, envs = _values(rows, variant), _values(rows, lambda row: row.cell.env)
+    figure, panels = panels_of(len(envs), len(variants), 2.5, 2.5)
+    for line, env in enumerate(envs):
+        for column, (method, lam) in enumerate(variants):
+            members = {row.cell.training: row for row in rows if row.cell.env == env and variant(row) == (method, lam)}
+            axes = panels[line, column]
+            if not members:
+                axes.set_axis_off()
+                continue
+            _routes_panel(axes, list(members.values()), episodes)
+            if line == 0:
+                axes.set_title(method if lam is None else _label(method, lam), color=INK, fontsize=10)
+            if column == 0:
+                axes.set_ylabel(env, color=INK, fontsize=10)
+    return figure
+
+
+def _routes_panel(axes: Axes, members: Sequence[Row], episodes: int) -> None:
+    draw_map(axes, members[0].finished.result.config.task()[1])
+    for row in members:
+        evaluation = row.finished.evaluation
+        for route, length in zip(evaluation.perceived[:episodes], evaluation.length[:episodes], strict=True):
+            draw_route(axes, route[: int(length) + 1], row.cell.method, max(0.35, 1 / len(members) ** 0.5))
+    draw_start(axes, members[0].finished.result.config.task()[1])
+
+
+def surrogate_maps(rows: Sequence[Row]) -> Figure | None:
+    """r_hat as a heat map beside the true l_H + r_H, for the first seed of each world and method that learned one."""
+    rows = [row for row in _good(rows) if _navigates(row) and hasattr(row.finished.result.knowledge, "surrogate")]
+    if not rows:
+        return None
+    lam = _middle_lam(rows)
+    first: dict[tuple[str, str], Row] = {}
+    for row in rows:
+        if row.cell.lam == lam:
+            first.setdefault((row.cell.env, row.cell.method), row)
+    figure, panels = panels_of(len(first), 2, 3.3, 2.75)
+    for line, ((env, method), row) in enumerate(first.items()):
+        learned, true, free = surrogate_values(row.finished.result)
+        params = row.finished.result.config.task()[1]
+        agreement = rank_correlation(learned[free], true[free])
+        titles = (f"learned r̂  (rank correlation {agreement:.2f})", "true ℓ_H + r_H")
+        for axes, values, title in zip(panels[line], (learned, true), titles, strict=True):
+            draw_heat(figure, axes, np.where(free, values, np.nan), params)
+            axes.set_title(title, color=INK, fontsize=9)
+        panels[line, 0].set_ylabel(f"{env}, {method}, seed {row.cell.seed}", color=INK, fontsize=9)
+    return figure
+
+
+def draw(rows: Sequence[Row], folder: Path) -> list[Path]:
+    """Writes every picture that `rows` have something for. Raises NotWrittenError."""
+    written = []
+    for name, make in zip(PICTURES, (learning_curves, frontier, routes, surrogate_maps), strict=True):
+        figure = make(rows)
+        if figure is not None:
+            written += save(figure, folder, name.removesuffix(".png"))
+    return written

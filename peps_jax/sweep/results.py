@@ -1,0 +1,291 @@
+"""A sweep's results folder: written batch by batch, each file whole or not at all, and read back cell by cell.
+
+    manifest.json    command, settings, versions, devices, times, cells
+    results.csv      one row for each cell of the grid
+    curves.npz       `env_steps` (rounds,), and every curve (cells, rounds) in the order of the rows; nan where a method has none
+    cells/*.msgpack  what each training learned and how it was evaluated, behind a line with the file's checksum
+    *.png            pictures, see `peps_jax.drawing.figures`
+    progress/        how far an unfinished sweep is, see `peps_jax.sweep.journal`
+
+A method that doesn't use lambda is trained once for each environment and seed; its rows for the grid's lambdas share that
+training's numbers and file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import io
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import flax.serialization
+import jax
+import numpy as np
+
+from peps_envs.registry import unknown_name
+from peps_jax.config import Config
+from peps_jax.evaluate import Evaluation
+from peps_jax.execution import machine
+from peps_jax.execution.batches import Finished, Times, empty_finished
+from peps_jax.storage import files
+from peps_jax.storage.tables import csv_bytes
+from peps_jax.train import Result, init
+
+MANIFEST, TABLE, CURVES, CELLS = "manifest.json", "results.csv", "curves.npz", "cells"
+PICTURES = ("learning_curves.png", "frontier.png", "routes.png", "surrogate.png")
+KEYS = ("env", "method", "lam", "seed")  # what tells a grid's cells apart
+
+
+class Cell(NamedTuple):
+    """A row of the grid, and the training that it shows."""
+
+    env: str
+    method: str
+    lam: float
+    seed: int
+    training: str  # name of the training; several rows share one where the method doesn't use lambda
+
+    @property
+    def name(self) -> str:
+        return f"{self.env}-{self.method}-lam{self.lam}-seed{self.seed}"
+
+    @property
+    def file(self) -> str:
+        return f"{CELLS}/{self.training}.msgpack"
+
+
+class Row(NamedTuple):
+    """A finished cell."""
+
+    cell: Cell
+    finished: Finished
+
+
+def holds_results(folder: Path) -> bool:
+    """Whether a sweep has written into `folder`."""
+    return any((folder / name).exists() for name in (MANIFEST, TABLE))
+
+
+def summary(evaluation: Evaluation) -> dict[str, float]:
+    """The numbers of a row: means over episodes; of each event the rate, e.g. `goal_rate` of `goal_reached`."""
+    mean = lambda values: float(np.mean(values))
+    spread = lambda values: float(np.std(values))
+    return {
+        "return_mean": mean(evaluation.return_),
+        "return_std": spread(evaluation.return_),
+        "explicability_mean": mean(evaluation.explicability),
+        "explicability_std": spread(evaluation.explicability),
+        "belief_gap_mean": mean(evaluation.belief_gap),
+        "human_return_mean": mean(evaluation.human_return),
+        "length_mean": mean(evaluation.length),
+        "explicability_with_policy_mean": mean(evaluation.explicability_with_policy),
+    } | {f"{name.removesuffix('_reached')}_rate": mean(values) for name, values in evaluation.events.items()}
+
+
+def record(row: Row) -> dict[str, Any]:
+    """A row of the table."""
+    cell = row.cell
+    status = "failed" if row.finished.failed else "ok"
+    return (
+        {key: getattr(cell, key) for key in KEYS}
+        | {"status": status}
+        | summary(row.finished.evaluation)
+        | {"cell": cell.name}
+    )
+
+
+# --- writing --------------------------------------------------------------------------------------------------------------
+
+
+def write_cell(folder: Path, training: str, finished: Finished) -> str:
+    """Writes what a training left; returns the file's checksum. Raises NotWrittenError."""
+    path = folder / CELLS / f"{training}.msgpack"
+    files.make_folder(path.parent)
+    content = files.seal(_learned(finished))
+    files.write_whole(path, content)
+    return files.digest(content)
+
+
+class Writer:
+    """Writes what a sweep's folder tells of its finished cells. `save` may come at any time; the folder is valid after each.
+
+    Raises:
+      NotWrittenError: there is no room, or no permission.
+    """
+
+    def __init__(self, folder: Path, command: str, settings: Mapping[str, Any]):
+        self.folder = folder
+        self._head = {"command": command, "configuration": files.plain(settings)} | machine.describe()
+
+    def save(self, rows: Sequence[Row], times: Times, env_steps: int, status: str) -> None:
+        """Writes the tables of the rows finished so far; `status` is "running", "complete" or "interrupted"."""
+        files.make_folder(self.folder)
+        if rows:
+            files.write_whole(self.folder / CURVES, _curves(rows))
+            files.write_whole(self.folder / TABLE, csv_bytes([record(row) for row in rows]))
+        manifest = self._head | {
+            "status": status,
+            "compile_seconds": round(times.compile, 3),
+            "run_seconds": round(times.run, 3),  # of training
+            "evaluation_seconds": round(times.evaluate, 3),
+            "env_steps": env_steps,
+            "env_steps_per_second": round(env_steps / times.run, 1) if times.run else 0.0,
+            "cells": [_entry(row) for row in rows],
+        }
+        files.write_whole(self.folder / MANIFEST, files.json_bytes(manifest))
+
+
+def clear(folder: Path) -> None:
+    """Removes a sweep's files; others stay. The manifest goes first: without it nothing is taken for results."""
+    for name in (MANIFEST, TABLE, CURVES, *PICTURES):
+        (folder / name).unlink(missing_ok=True)
+    for path in (folder / CELLS).glob("*.msgpack"):
+        path.unlink(missing_ok=True)
+
+
+def _entry(row: Row) -> dict[str, Any]:
+    """A cell's place in the manifest."""
+    cell = row.cell
+    return {"name": cell.name} | {key: getattr(cell, key) for key in KEYS} | {"file": cell.file}
+
+
+def _learned(finished: Finished) -> bytes:
+    """What a training leaves; the world's numbers too, so that it is evaluated in the world it was trained in."""
+    result = finished.result
+    _, params, belief = result.config.task()
+    parts = {
+        "agents": result.agents,
+        "knowledge": result.knowledge,
+        "curves": result.curves,
+        "params": params,
+        "belief": belief,
+        "evaluation": finished.evaluation,
+        "failed": finished.failed,
+    }
+    return flax.serialization.to_bytes(jax.tree.map(np.asarray, parts))
+
+
+def read_cell(folder: Path, training: str, config: Config, num_episodes: int, checksum: str) -> Finished:
+    """What `write_cell` was given.
+
+    Raises:
+      DamagedError: the file isn't the one with that checksum.
+    """
+    try:
+        content = (folder / CELLS / f"{training}.msgpack").read_bytes()
+    except OSError:
+        raise files.DamagedError("it is missing") from None
+    if files.digest(content) != checksum:
+        raise files.DamagedError("its checksum is wrong")
+    stored = flax.serialization.msgpack_restore(files.unseal(content))
+    result, evaluation = empty_finished(config, num_episodes)
+    restore = flax.serialization.from_state_dict
+    result = result.replace(
+        agents=restore(result.agents, stored["agents"]),
+        knowledge=restore(result.knowledge, stored["knowledge"]),
+        curves=stored["curves"],
+        config=config,
+    )
+    return Finished(result, restore(evaluation, stored["evaluation"]), bool(stored["failed"]))
+
+
+def _curves(rows: Sequence[Row]) -> bytes:
+    names = sorted({name for row in rows for name in row.finished.result.curves})
+    config = rows[0].finished.result.config
+    nothing = np.full(config.num_rounds, np.nan, np.float32)
+    curves = {name: np.stack([row.finished.result.curves.get(name, nothing) for row in rows]) for name in names}
+    env_steps = config.steps_per_round * np.arange(1, config.num_rounds + 1)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, env_steps=env_steps, **curves)
+    return buffer.getvalue()
+
+
+# --- reading --------------------------------------------------------------------------------------------------------------
+
+
+def load(folder: str | os.PathLike[str], cell: int | str | Mapping[str, Any]) -> Result:
+    """A cell of a sweep, ready to act: `load("results/sweep", "nav-d1-peps-lam2.4-seed0").act(observation)`.
+
+    Args:
+      folder: that the sweep wrote.
+      cell: its row in results.csv, from 0; or its name, the column `cell`; or what tells it apart, e.g. {"env": "nav-d1",
+        "method": "peps", "seed": 0}.
+
+    Raises:
+      ValueError: no results there, no such cell, more than one, or a file that this version can't read.
+    """
+    folder = Path(folder)
+    try:
+        manifest = json.loads((folder / MANIFEST).read_text())
+        cells, configuration = manifest["cells"], manifest["configuration"]
+    except (OSError, ValueError, KeyError):
+        raise ValueError(f"folder {str(folder)!r} holds no sweep's results: {MANIFEST} is missing or broken") from None
+    entry = _find(cells, cell)
+    config = _config(configuration, entry)
+    _, params, belief = config.task()
+    shapes = jax.eval_shape(init, config)
+    empty = {"agents": shapes.agents, "knowledge": shapes.knowledge, "params": params, "belief": belief}
+    path = folder / entry["file"]
+    try:
+        content = path.read_bytes()
+        stored = flax.serialization.msgpack_restore(files.unseal(content) if files.is_sealed(content) else content)
+        curves = stored.pop("curves")
+        stored = {name: value for name, value in stored.items() if name in empty}
+        parts = flax.serialization.from_state_dict(empty, stored)
+    except OSError:
+        raise ValueError(f"file {str(path)!r} is missing: the folder is incomplete; run the sweep again") from None
+    except files.DamagedError as error:
+        raise ValueError(f"file {str(path)!r} is damaged ({error}): run the sweep again") from None
+    except (ValueError, KeyError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"file {str(path)!r} was written by a version that doesn't fit this one: {reason}") from None
+    config = config.replace(params=parts["params"], belief=parts["belief"])
+    return Result(agents=parts["agents"], knowledge=parts["knowledge"], curves=curves, config=config)
+
+
+def _find(cells: Sequence[Mapping[str, Any]], wanted: int | str | Mapping[str, Any]) -> Mapping[str, Any]:
+    """The manifest's entry of a cell."""
+    if isinstance(wanted, Mapping):
+        for key in wanted:
+            if key not in KEYS:
+                raise ValueError(unknown_name("key", key, KEYS))
+        found = [entry for entry in cells if all(entry[key] == value for key, value in wanted.items())]
+        if len(found) != 1:
+            told = ", ".join(entry["name"] for entry in (found or cells)[:4])
+            more = " ..." if len(found or cells) > 4 else ""
+            raise ValueError(f"cell {dict(wanted)!r} matches {len(found)} of {len(cells)} cells, not one: {told}{more}")
+        return found[0]
+    if isinstance(wanted, str):
+        by_name = {entry["name"]: entry for entry in cells}
+        if wanted not in by_name:
+            nearest = difflib.get_close_matches(wanted, by_name, n=3, cutoff=0)
+            raise ValueError(f"cell {wanted!r} is unknown: of {len(cells)} cells the nearest are {', '.join(nearest)}")
+        return by_name[wanted]
+    if not 0 <= wanted < len(cells):
+        raise ValueError(f"cell {wanted} is out of range: choose 0 to {len(cells) - 1}")
+    return cells[wanted]
+
+
+def _config(configuration: Mapping[str, Any], entry: Mapping[str, Any]) -> Config:
+    """A cell's `Config`: the sweep's settings, and what is the cell's own."""
+    own = {key: value for key, value in entry.items() if key in KEYS}
+    values = tuples({name: value for name, value in configuration.items() if name not in KEYS} | own)
+    names = {
+        field.name for field in dataclasses.fields(Config)
+    }  # an older folder may lack one, a newer one may have more
+    return Config(**{name: value for name, value in values.items() if name in names})
+
+
+def tuples(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as `plain` was given them: lists are tuples again, text for a number is one."""
+    defaults = {field.name: field.default for field in dataclasses.fields(Config)}
+    values = {}
+    for name, value in configuration.items():
+        if isinstance(defaults.get(name), float) and isinstance(value, str):
+            value = float(value)
+        values[name] = tuple(value) if isinstance(value, list) else value
+    return values
