@@ -159,8 +159,12 @@ def test_life_and_death_are_told_apart(tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "BEAT", 0.05)
     (tmp_path / "progress").mkdir()
     teams = [workers.Team(index, 4, "now") for index in range(4)]
-    workers.Life(tmp_path, teams[1]._replace(run="earlier")).end(workers.DONE)
+    earlier = workers.Life(tmp_path, teams[1]._replace(run="earlier"))
+    earlier.begin()
+    earlier.end(workers.DONE)
     done, alive = workers.Life(tmp_path, teams[2]), workers.Life(tmp_path, teams[3])
+    done.begin()
+    alive.begin()
     others = workers.Others(tmp_path, teams[0])
     assert others.ends() == {}
     done.end(workers.DONE)

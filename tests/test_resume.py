@@ -19,7 +19,7 @@ from commands import contents, exit_code
 import peps_envs
 from peps_jax.execution import batches, checkpoints, compilation_cache
 from peps_jax.storage import files
-from peps_jax.sweep import command, journal, pictures, results
+from peps_jax.sweep import command, journal, pictures, results, underway
 from peps_jax.train import init
 
 # a real death takes the threads of Orbax with it; here they come back to a loop that is no more
@@ -116,7 +116,7 @@ def stopped(made, tmp_path):
 
 def stop_after(patch, chunks: int) -> None:
     """SIGTERM comes in that chunk."""
-    advanced, left = command.Keeper.advanced, [chunks]
+    advanced, left = underway.Keeper.advanced, [chunks]
 
     def hear(self, *arguments):
         left[0] -= 1
@@ -124,7 +124,7 @@ def stop_after(patch, chunks: int) -> None:
             os.kill(os.getpid(), signal.SIGTERM)
         advanced(self, *arguments)
 
-    patch.setattr(command.Keeper, "advanced", hear)
+    patch.setattr(underway.Keeper, "advanced", hear)
 
 
 # --- stopped and killed ---------------------------------------------------------------------------------------------------
@@ -168,7 +168,7 @@ def test_killed_at_the_very_end(whole, tmp_path, monkeypatch, capsys):
 def test_killed_anywhere_and_continued(whole, tmp_path, monkeypatch):
     """The same command again and again, as a script would give it, until the sweep is complete; and so on."""
     chance, kills, trainings = random.Random(0), 0, 0
-    advanced, run = command.Keeper.advanced, batches.Program.run
+    advanced, run = underway.Keeper.advanced, batches.Program.run
 
     def hear(self, *arguments):
         DEATH.tick()
@@ -180,7 +180,7 @@ def test_killed_anywhere_and_continued(whole, tmp_path, monkeypatch):
         assert not {f"line-sac-seed{cell.seed}" for cell in cells} & set().union(*done), "a finished cell runs again"
         return run(self, cells, *arguments)
 
-    monkeypatch.setattr(command.Keeper, "advanced", hear)
+    monkeypatch.setattr(underway.Keeper, "advanced", hear)
     monkeypatch.setattr(batches.Program, "run", run_unfinished)
     while kills < KILLS:
         folder = tmp_path / str(trainings)

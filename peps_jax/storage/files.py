@@ -1,19 +1,22 @@
 """Files that survive a kill: each is whole or not there, and what was damaged since is noticed.
 
-A process may end at any moment, between any two of these functions' steps, without a reader seeing a half.
+A process may end at any moment, between any two of these functions' steps, without a reader seeing a half. Inside a folder
+that a run has claimed (`peps_jax.storage.ownership`), they write and remove for the folder's owner alone.
 """
 
 from __future__ import annotations
 
+import contextlib
+import contextvars
 import hashlib
 import json
 import math
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 TEMPORARY = ".unfinished-"  # beginning of the name of what isn't in its place yet
 _SEAL = b"sha256 "
@@ -24,8 +27,59 @@ class NotWrittenError(Exception):
     """The system refused to write; one line says what and why."""
 
 
+class OwnershipLostError(NotWrittenError):
+    """The folder belongs to another run now, so this one may not write there; one line says so."""
+
+
 class DamagedError(ValueError):
     """A file isn't what was written."""
+
+
+class Claim(NamedTuple):
+    """What lets a run write into a folder."""
+
+    folder: Path  # absolute
+    workshop: (
+        Path  # in the folder: whatever is put into it, or taken out, passes through here. Who loses it can do neither
+    )
+
+    @property
+    def lost(self) -> bool:
+        return not os.path.isdir(self.workshop)
+
+    def refusal(self) -> OwnershipLostError:
+        return OwnershipLostError(
+            f"this run has lost the folder {str(self.folder)!r}, which another one took over (or somebody moved or removed): "
+            "it writes nothing there any more"
+        )
+
+
+_CLAIM: contextvars.ContextVar[Claim | None] = contextvars.ContextVar("claim", default=None)
+
+
+@contextlib.contextmanager
+def writing_under(claim: Claim) -> Iterator[None]:
+    """Whatever this thread writes into the claimed folder meanwhile is written under that claim."""
+    token = _CLAIM.set(claim)
+    try:
+        yield
+    finally:
+        _CLAIM.reset(token)
+
+
+def _claim_on(path: Path) -> Claim | None:
+    """The claim under which `path` is written, or None: it lies elsewhere, or nobody claimed its folder."""
+    claim = _CLAIM.get()
+    inside = claim is not None and Path(os.path.abspath(path)).is_relative_to(claim.folder)
+    return claim if inside else None
+
+
+def _refusal(path: Path, act: str, error: OSError) -> NotWrittenError:
+    """Why the system refused to do that: the folder is lost, or it has a reason of its own."""
+    claim = _claim_on(path)
+    if claim is not None and claim.lost:
+        return claim.refusal()
+    return NotWrittenError(f"{str(path)!r} can't be {act}: {error.strerror or error}")
 
 
 def digest(content: bytes) -> str:
@@ -60,24 +114,25 @@ def write_whole(path: Path, content: bytes) -> None:
 
     Raises:
       NotWrittenError: there is no room, or no permission.
+      OwnershipLostError: the folder was claimed, and is another run's now.
     """
+    write_with(path, lambda unfinished: unfinished.write_bytes(content))
 
-    def write(unfinished: Path) -> None:
-        with open(unfinished, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
 
-    _put_in_place(path, write)
+def write_with(path: Path, write: Callable[[Path], object]) -> None:
+    """Like `write_whole`, of a file that something else writes: `write` gets the path where it is to be made, of the same name."""
+
+    def write_synced(unfinished: Path) -> None:
+        write(unfinished)
+        _sync(unfinished)
+
+    _put_in_place(path, write_synced)
 
 
 def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
     """Writes a folder as `write_whole` does a file: `fill` gets an empty one, whose files are then moved to `path` at once.
 
-    What is at `path` already is removed just before.
-
-    Raises:
-      NotWrittenError: there is no room, or no permission.
+    What is at `path` already is removed just before. Raises what `write_whole` does.
     """
 
     def write(unfinished: Path) -> None:
@@ -92,15 +147,30 @@ def write_folder(path: Path, fill: Callable[[Path], None]) -> None:
 
 def _put_in_place(path: Path, write: Callable[[Path], None]) -> None:
     try:
-        parent = Path(tempfile.mkdtemp(dir=path.parent, prefix=f"{TEMPORARY}{path.name}-"))
-        try:
-            write(parent / path.name)
-            os.replace(parent / path.name, path)
+        with _aside(path) as aside:
+            write(aside / path.name)
+            os.replace(aside / path.name, path)
             _sync(path.parent)
-        finally:
-            shutil.rmtree(parent, ignore_errors=True)
     except OSError as error:
-        raise NotWrittenError(f"{str(path)!r} can't be written: {error.strerror or error}") from None
+        raise _refusal(path, "written", error) from None
+
+
+@contextlib.contextmanager
+def _aside(path: Path) -> Iterator[Path]:
+    """A folder on the same disk as `path` for what isn't in its place yet, or any more; removed in the end.
+
+    It is beside `path`, or in the workshop of who claimed the folder: then nothing can be moved from here into its place, or
+    the other way, once that is another's.
+    """
+    claim = _claim_on(path)
+    if claim is None:
+        aside = Path(tempfile.mkdtemp(dir=path.parent, prefix=f"{TEMPORARY}{path.name}-"))
+    else:
+        aside = Path(tempfile.mkdtemp(dir=claim.workshop))
+    try:
+        yield aside
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 def _sync(path: Path) -> None:
@@ -113,29 +183,43 @@ def _sync(path: Path) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Makes a folder and those above it. Raises NotWrittenError if that can't be."""
+    """Makes a folder and those above it. Raises what `write_whole` does."""
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        if _claim_on(path) is None:
+            path.mkdir(parents=True, exist_ok=True)
+        elif not os.path.isdir(path):
+            make_folder(path.parent)
+            with _aside(path) as aside:
+                (aside / path.name).mkdir()
+                os.rename(aside / path.name, path)
     except OSError as error:
-        raise NotWrittenError(f"folder {str(path)!r} can't be made: {error.strerror or error}") from None
+        if not os.path.isdir(path):  # another process of the same run may have made it meanwhile
+            raise _refusal(path, "made", error) from None
 
 
 def remove(path: Path) -> None:
-    """Removes a folder, if it is there: at once for a reader, who never sees a part of it."""
-    leaving = path.with_name(f"{TEMPORARY}{path.name}-removed-{os.getpid()}")
+    """Removes a file or a folder, if it is there: at once for a reader, who never sees a part of it.
+
+    Raises what `write_whole` does.
+    """
     try:
-        os.replace(path, leaving)
-    except FileNotFoundError:
-        return
+        with _aside(path) as aside:
+            os.replace(path, aside / path.name)
     except OSError as error:
-        raise NotWrittenError(f"{str(path)!r} can't be removed: {error.strerror or error}") from None
-    shutil.rmtree(leaving, ignore_errors=True)
+        refusal = _refusal(path, "removed", error)
+        if os.path.lexists(path) or isinstance(refusal, OwnershipLostError):
+            raise refusal from None
 
 
 def remove_unfinished(folder: Path) -> None:
     """Removes what processes that were killed have left, in `folder` and the folders inside."""
-    for path in [*folder.rglob(f"{TEMPORARY}*")]:
-        shutil.rmtree(path, ignore_errors=True)
+    try:
+        for path in [*folder.rglob(f"{TEMPORARY}*")]:
+            remove(path)
+    except OwnershipLostError:
+        raise
+    except (OSError, NotWrittenError):  # names vanish while they are listed; and what remains does no harm
+        pass
 
 
 def checksums(folder: Path) -> dict[str, str]:

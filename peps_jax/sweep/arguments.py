@@ -182,11 +182,8 @@ def read(arguments: Sequence[str]) -> Request:
         raise ValueError(f"seed {settings['seed']} is out of range: choose 0 to {last}")
     cells, trainings = grid(settings)
     out = Path(running["out"])
-    if results.holds_results(out) and not (resume or running["overwrite"]):
-        raise ValueError(
-            f"out {str(out)!r} holds another run's results: choose another folder, add --overwrite to replace them, "
-            "or --resume to continue"
-        )
+    if not (resume or running["overwrite"]):
+        results.check_free(out)
     files.check_writable(out)
     return Request(cells, trainings, settings, running, resume, begun_by)
 

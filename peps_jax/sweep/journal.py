@@ -11,8 +11,8 @@ at any time. The folder is removed when the sweep is complete.
 
 from __future__ import annotations
 
+import contextlib
 import json
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ import numpy as np
 from peps_jax.config import Config
 from peps_jax.execution.batches import Finished, Times, shared
 from peps_jax.execution.checkpoints import FORMAT, Checkpoints
-from peps_jax.storage import files
+from peps_jax.storage import files, ownership
 from peps_jax.sweep import results
 
 FOLDER, PLAN = "progress", "plan.json"
@@ -119,7 +119,10 @@ class Ledger:
         sums = {training: results.write_cell(self._results, training, finished) for training, finished in cells.items()}
         content = {"cells": sums, "times": times._asdict()}
         files.write_whole(self.folder / f"{_name(number)}.json", files.seal(files.json_bytes(content)))
-        files.remove(self.folder / _name(number))
+        with contextlib.suppress(
+            files.OwnershipLostError
+        ):  # process 0 may be done with the folder by now, if this was all
+            files.remove(self.folder / _name(number))
 
     def done(self, number: int) -> Done | None:
         """Batch `number`, or None if it isn't done.
@@ -134,6 +137,11 @@ class Ledger:
         return Done(stored["cells"], Times(**stored["times"]))
 
 
+def is_open(folder: Path) -> bool:
+    """Whether anything in `folder` tells of a sweep that is under way."""
+    return (folder / FOLDER).exists() or bool(ownership.owners(folder)) or any(folder.glob(f"{files.TEMPORARY}*"))
+
+
 def close(folder: Path) -> None:
     """Removes the progress of a sweep that is complete, and what processes that were killed have left. Raises NotWrittenError."""
     files.remove(folder / FOLDER)
@@ -141,12 +149,9 @@ def close(folder: Path) -> None:
 
 
 def clear(folder: Path) -> None:
-    """Removes a sweep and its progress from `folder`; other files stay."""
-    try:
-        results.clear(folder)
-        shutil.rmtree(folder / FOLDER, ignore_errors=True)
-    except OSError as error:
-        raise files.NotWrittenError(f"folder {str(folder)!r} can't be cleared: {error.strerror}") from None
+    """Removes a sweep and its progress from `folder`; other files stay. Raises NotWrittenError."""
+    results.clear(folder)
+    files.remove(folder / FOLDER)
 
 
 def numbers_digest(cells: Sequence[Config]) -> str:

@@ -13,6 +13,7 @@ training's numbers and file.
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import difflib
 import io
@@ -68,6 +69,33 @@ class Row(NamedTuple):
 def holds_results(folder: Path) -> bool:
     """Whether a sweep has written into `folder`."""
     return any((folder / name).exists() for name in (MANIFEST, TABLE))
+
+
+def check_free(folder: Path) -> None:
+    """Raises ValueError if a sweep has written into `folder`."""
+    if holds_results(folder):
+        raise ValueError(
+            f"out {str(folder)!r} holds another run's results: choose another folder, add --overwrite to replace them, "
+            "or --resume to continue"
+        )
+
+
+def is_complete(folder: Path) -> bool:
+    """Whether the sweep in `folder` has nothing left to do."""
+    try:
+        return json.loads((folder / MANIFEST).read_text()).get("status") == "complete"
+    except (OSError, ValueError):
+        return False
+
+
+def all_failed(folder: Path) -> bool:
+    """Whether no cell of the sweep in `folder` has numbers that are finite."""
+    try:
+        file = open(folder / TABLE, newline="")
+    except OSError:
+        return False
+    with file:
+        return all(row["status"] == "failed" for row in csv.DictReader(file))
 
 
 def summary(evaluation: Evaluation) -> dict[str, float]:
@@ -142,9 +170,9 @@ class Writer:
 def clear(folder: Path) -> None:
     """Removes a sweep's files; others stay. The manifest goes first: without it nothing is taken for results."""
     for name in (MANIFEST, TABLE, CURVES, *PICTURES):
-        (folder / name).unlink(missing_ok=True)
+        files.remove(folder / name)
     for path in (folder / CELLS).glob("*.msgpack"):
-        path.unlink(missing_ok=True)
+        files.remove(path)
 
 
 def _entry(row: Row) -> dict[str, Any]:

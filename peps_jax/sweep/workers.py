@@ -9,6 +9,7 @@ a child process; after that they only share the folder, and every process is a p
 from __future__ import annotations
 
 import argparse
+import contextvars
 import json
 import os
 import subprocess
@@ -110,21 +111,30 @@ def _meet(asked: dict[str, Any]) -> Team:
 
 
 class Life:
-    """Tells the others, by a file in the sweep's folder, that this process is at work; and how it ended."""
+    """Tells the others, by a file in the sweep's folder, that this process is at work; and how it ended.
+
+    It is silent once the folder is another sweep's.
+    """
 
     def __init__(self, folder: Path, team: Team):
         self._path = _path(folder, team.index)
         self._team, self._beats = team, 0
         self._over = threading.Event()
-        self._thread = threading.Thread(target=self._beat, daemon=True)
+        self._thread: threading.Thread | None = None
         self._told = {"status": RUNNING, "reason": ""}
-        if team.count > 1:
+
+    def begin(self) -> None:
+        """From now on there is a sign of life every `BEAT` seconds."""
+        if self._team.count > 1:
             self._tell()
+            # in a copy of the context, for the thread writes as this one does: for the folder's owner
+            beat = contextvars.copy_context().run
+            self._thread = threading.Thread(target=beat, args=(self._beat,), daemon=True)
             self._thread.start()
 
     def end(self, status: str, reason: str = "") -> None:
         """How it ended: DONE, STOPPED or FAILED."""
-        if self._team.count > 1 and not self._over.is_set():
+        if self._thread is not None and not self._over.is_set():
             self._over.set()
             self._thread.join()
             self._told = {"status": status, "reason": reason}
@@ -139,6 +149,8 @@ class Life:
         told = self._told | {"run": self._team.run, "beat": self._beats}
         try:
             files.write_whole(self._path, files.json_bytes(told))
+        except files.OwnershipLostError:
+            self._over.set()  # the sweep finds out by itself, and says so
         except files.NotWrittenError as error:
             # no reason to stop: whoever writes what counts complains; and a sweep that is complete has no such folder
             if self._path.parent.exists():
