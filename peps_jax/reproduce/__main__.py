@@ -24,7 +24,7 @@ from peps_jax.reproduce.driving.experiment import STEPS
 from peps_jax.reproduce.figures import QUERY_SEEDS
 from peps_jax.reproduce.store import Store
 from peps_jax.reproduce.trainings import DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
-from peps_jax.storage.files import NotWrittenError
+from peps_jax.storage.files import NotWrittenError, OwnershipLostError
 
 PROG = "python -m peps_jax.reproduce"
 MOST = 1000  # seeds
@@ -138,7 +138,10 @@ def main(arguments: Sequence[str] | None = None, base: Config | None = None, num
     except (ValueError, NotWrittenError) as error:
         return refuse(PROG, error)
     try:
-        written = run(wanted)
+        with wanted.store.writing():
+            written = run(wanted)
+    except OwnershipLostError as error:
+        return refuse(PROG, error)
     except KeyboardInterrupt:
         print(
             f"\nstopped: what is finished is kept in {wanted.store.folder}; the same command continues", file=sys.stderr
@@ -146,6 +149,8 @@ def main(arguments: Sequence[str] | None = None, base: Config | None = None, num
         return 130
     except NotWrittenError as error:
         return refuse(PROG, f"{error}; what is finished is kept, and the same command continues")
+    finally:
+        wanted.store.close()
     for path in written:
         if path.suffix == ".md":
             print(path.read_text())

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ from peps_jax.evaluate import Evaluation
 from peps_jax.execution import machine
 from peps_jax.storage import code, files
 from peps_jax.storage.arrays import read_arrays, write_arrays
+from peps_jax.storage.ownership import Owner, holds_nothing
 
 HEAD, CELLS = "reproduce.json", "cells"
 ROUTES = 3  # episodes of each training whose route is kept
@@ -72,7 +74,7 @@ def code_digest() -> str:
 
 
 class Store:
-    """A folder of records. Opening it checks, and writes nothing.
+    """A folder of records: who constructs one may read it, who opens it owns it.
 
     Raises:
       ValueError: the folder holds something else, or what other settings, other code or more seeds made.
@@ -83,12 +85,13 @@ class Store:
         self._code = code_digest()
         self._episodes = num_episodes
         self._head = {"settings": settings_of(config) | {"episodes": num_episodes}, "code": self._code, "seeds": seeds}
+        self._owner = Owner(folder)
         files.check_writable(folder)
         self._check()
 
     def _check(self) -> None:
         name, advice = f"out {str(self.folder)!r}", "choose another folder"
-        if not self.folder.exists() or not any(self.folder.iterdir()):
+        if holds_nothing(self.folder):
             return
         try:
             head = json.loads((self.folder / HEAD).read_text())
@@ -106,19 +109,24 @@ class Store:
             )
 
     def open(self) -> None:
-        """Makes the folder, and writes what it is about.
+        """Takes the folder, from a run that was stopped or is elsewhere, too; makes it, and writes what it is about.
 
         Raises:
-          ValueError: it can't be made.
+          ValueError: it holds something else by now, or somebody else takes it at this moment.
+          NotWrittenError: it can't be made or written.
         """
-        try:
-            (self.folder / CELLS).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ValueError(
-                f"out {str(self.folder)!r} can't be made: {error.strerror}; choose another folder"
-            ) from None
-        head = self._head | machine.describe()
-        files.write_whole(self.folder / HEAD, files.json_bytes(head))
+        self._owner.claim(self._check, over=True)
+        with self.writing():
+            files.make_folder(self.folder / CELLS)
+            files.write_whole(self.folder / HEAD, files.json_bytes(self._head | machine.describe()))
+
+    def writing(self) -> AbstractContextManager[None]:
+        """What is written into the folder meanwhile is written for its owner: OwnershipLostError if that is another run now."""
+        return self._owner.writing()
+
+    def close(self) -> None:
+        """Gives the folder back."""
+        self._owner.release()
 
     def _path(self, name: str) -> Path:
         return self.folder / CELLS / f"{name}.npz"
@@ -128,11 +136,12 @@ class Store:
         return digest(recipe, self._code, self._episodes)
 
     def save(self, name: str, recipe: Mapping[str, Any], record: Record) -> None:
-        """Keeps a record."""
+        """Keeps a record. Raises OwnershipLostError if the folder isn't this run's any more."""
         arrays = {"routes": record.routes, "failed": record.failed, "seconds": np.array(record.seconds)}
         for part in ("mode", "sampled", "heat"):
             arrays |= {f"{part}/{key}": values for key, values in getattr(record, part).items()}
-        write_arrays(self._path(name), self.digest(recipe), arrays)
+        with self.writing():
+            write_arrays(self._path(name), self.digest(recipe), arrays)
 
     def load(self, name: str, recipe: Mapping[str, Any]) -> Record | None:
         """The record called `name`, or None if there is none.

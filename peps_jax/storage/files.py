@@ -216,10 +216,10 @@ def remove_unfinished(folder: Path) -> None:
     try:
         for path in [*folder.rglob(f"{TEMPORARY}*")]:
             remove(path)
-    except OwnershipLostError:
-        raise
     except (OSError, NotWrittenError):  # names vanish while they are listed; and what remains does no harm
-        pass
+        claim = _claim_on(folder)
+        if claim is not None and claim.lost:
+            raise claim.refusal() from None
 
 
 def checksums(folder: Path) -> dict[str, str]:

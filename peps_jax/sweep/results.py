@@ -91,11 +91,10 @@ def is_complete(folder: Path) -> bool:
 def all_failed(folder: Path) -> bool:
     """Whether no cell of the sweep in `folder` has numbers that are finite."""
     try:
-        file = open(folder / TABLE, newline="")
+        table = (folder / TABLE).read_text(encoding="utf-8")
     except OSError:
         return False
-    with file:
-        return all(row["status"] == "failed" for row in csv.DictReader(file))
+    return all(row["status"] == "failed" for row in csv.DictReader(io.StringIO(table)))
 
 
 def summary(evaluation: Evaluation) -> dict[str, float]:

@@ -16,6 +16,7 @@ from pathlib import Path
 from peps_jax.command_line import Parser, options, refuse, use_every_core
 from peps_jax.reproduce.driving import experiment, report
 from peps_jax.storage.files import NotWrittenError, check_writable
+from peps_jax.storage.ownership import Owner
 
 PROG = "python -m peps_jax.reproduce.driving"
 MOST = 1000  # seeds
@@ -31,6 +32,16 @@ class Request:
 
     parts: list[experiment.Part]
     out: Path
+    overwrite: bool
+
+    def check_free(self) -> None:
+        """Raises ValueError if the folder holds a study that nobody asked to replace."""
+        there = [name for name in FILES if (self.out / name).exists()]
+        if there and not self.overwrite:
+            raise ValueError(
+                f"out {str(self.out)!r} holds another study ({there[0]}): choose another folder, "
+                "or add --overwrite to replace it"
+            )
 
 
 def parser() -> Parser:
@@ -73,14 +84,10 @@ def request(arguments: Sequence[str]) -> Request:
     parts = experiment.parts(range(values.seed, values.seed + values.seeds), values.steps, dict.fromkeys(values.lams))
     for part in parts:
         part.configs[0].check()
-    out = Path(values.out)
-    check_writable(out)
-    there = [name for name in FILES if (out / name).exists()]
-    if there and not values.overwrite:
-        raise ValueError(
-            f"out {str(out)!r} holds another study ({there[0]}): choose another folder, or add --overwrite to replace it"
-        )
-    return Request(parts, out)
+    wanted = Request(parts, Path(values.out), values.overwrite)
+    check_writable(wanted.out)
+    wanted.check_free()
+    return wanted
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -88,15 +95,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     use_every_core()
     try:
         wanted = request(sys.argv[1:] if arguments is None else arguments)
+        owner = Owner(wanted.out)
+        owner.claim(wanted.check_free, over=wanted.overwrite)
     except (ValueError, NotWrittenError) as error:
         return refuse(PROG, error)
     try:
-        written = report.write(experiment.run(wanted.parts), wanted.out)
+        with owner.writing():
+            written = report.write(experiment.run(wanted.parts), wanted.out)
     except KeyboardInterrupt:
         print("\nstopped: nothing is written", file=sys.stderr)
         return 130
     except NotWrittenError as error:
         return refuse(PROG, error)
+    finally:
+        owner.release()
     print((wanted.out / report.TABLE).read_text())
     print(f"in {wanted.out}: {', '.join(path.name for path in written)}")
     return 0

@@ -68,6 +68,6 @@ def _make(part: Part, folder: Path) -> Seen:
         like = jax.eval_shape(lambda config: experiment.learn(config, part.episodes), part.configs[0])
         return jax.tree.unflatten(jax.tree.structure(like), _leaves(part, folder))
     seen = experiment.run_part(part)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    files.make_folder(path.parent)
     write_arrays(path, _digest(part), {str(place): leaf for place, leaf in enumerate(jax.tree.leaves(seen))})
     return seen

@@ -96,10 +96,10 @@ def write(findings: Findings, folder: Path) -> list[Path]:
         for method in findings.scenes
     }
     shown = {titles[method]: typical(scenes) for method, scenes in findings.scenes.items()}
-    folder.mkdir(parents=True, exist_ok=True)
+    files.make_folder(folder)
     note = f"ratings by simulated participants; one-way ANOVA: p = {rated.p:.2g}"
-    driving.strips(shown, note).savefig(folder / PICTURE, dpi=150)
-    driving.animate(shown, folder / FILM)
+    files.write_with(folder / PICTURE, lambda path: driving.strips(shown, note).savefig(path, dpi=150))
+    files.write_with(folder / FILM, lambda path: driving.animate(shown, path))
     numbers = json.dumps(summary(findings), indent=1, allow_nan=False) + "\n"
     files.write_whole(folder / NUMBERS, numbers.encode())
     files.write_whole(folder / TABLE, text(findings).encode())
