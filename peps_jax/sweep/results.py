@@ -6,6 +6,7 @@
     cells/*.msgpack  what each training learned and how it was evaluated, behind a line with the file's checksum
     *.png            pictures, see `peps_jax.drawing.figures`
     progress/        how far an unfinished sweep is, see `peps_jax.sweep.journal`
+    .owner/          whose the folder is while it is written, see `peps_jax.storage.ownership`
 
 A method that doesn't use lambda is trained once for each environment and seed; its rows for the grid's lambdas share that
 training's numbers and file.
