@@ -39,9 +39,7 @@ class Claim(NamedTuple):
     """What lets a run write into a folder."""
 
     folder: Path  # absolute
-    workshop: (
-        Path  # in the folder: whatever is put into it, or taken out, passes through here. Who loses it can do neither
-    )
+    workshop: Path  # in the folder; what is put there or taken away passes through it, so who loses it can do neither
 
     @property
     def lost(self) -> bool:
