@@ -128,21 +128,21 @@ class Highway(Environment):
 
     @property
     def observation_space(self) -> Bounds:
-        """Speeds within what slows a car down, places on the road or a little beside it, headings that steering aims at.
+        """Speeds up to what slows a car down, places on the road, headings that steering aims at.
 
         How far away others are and how hard they brake is the scenario's business: it has no bounds here.
         """
-        aside, speed = self.lanes + 1.0, MAX_SPEED / SPEED_SCALE
+        lanes, speed = float(self.lanes), MAX_SPEED / SPEED_SCALE
         heading = math.pi / 4 / HEADING_SCALE
         own = [
             (0.0, speed),
-            (-1.0, float(self.lanes)),
+            (-0.5, lanes - 0.5),
             (-heading, heading),
-            (0.0, self.lanes - 1.0),
+            (0.0, lanes - 1.0),
             (0.0, speed),
             (0.0, 1.0),
         ]
-        theirs = [(-math.inf, math.inf), (-aside, aside), (-speed, speed), (0.0, math.inf)]
+        theirs = [(-math.inf, math.inf), (-lanes, lanes), (-speed, speed), (0.0, math.inf)]
         low, high = zip(*own, *theirs * (1 + self.traffic), strict=True)
         return Bounds(low, high)
 

@@ -36,7 +36,9 @@ def _log_interval(value: Array, mean: Array, noise: Array, width: Array, low: Ar
 
 def _log_tail(distance_to_edge: Array, noise: Array) -> Array:
     """log P(noise * xi > distance_to_edge), exact for noise = 0 too, floored to stay finite."""
-    return jnp.maximum(log_ndtr(-distance_to_edge / jnp.maximum(noise, 1e-6)), math.log(_TINY))
+    # beyond 20 standard deviations lies the floor, and the derivative there would be 0 times infinity
+    away = jnp.clip(distance_to_edge / jnp.maximum(noise, 1e-6), -20.0, 20.0)
+    return jnp.maximum(log_ndtr(-away), math.log(_TINY))
 
 
 def _log_stopped(value: Array, mean: Array, noise: Array, width: Array, low: Array, high: Array) -> Array:

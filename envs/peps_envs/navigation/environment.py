@@ -23,7 +23,7 @@ from jax import Array
 
 from peps_envs.environment import Bounds, Box, Environment, Step
 from peps_envs.navigation.density import NavigationDensity
-from peps_envs.navigation.geometry import SLACK, distance, inside, walk
+from peps_envs.navigation.geometry import SLACK, distance, inside, root, walk
 from peps_envs.navigation.parameters import NavigationParams
 from peps_envs.navigation.scene import agent, ground, view
 from peps_envs.scene import Scene
@@ -96,7 +96,7 @@ class Navigation(Environment):
         return NavigationDensity(
             position=position,
             target=walk(position, position + gain * params.step_length * direction, params),
-            noise=jnp.sqrt(near_pit**2 + jnp.where(on_ice, params.ice_noise, 0.0) ** 2),
+            noise=root(near_pit**2 + jnp.where(on_ice, params.ice_noise, 0.0) ** 2),
             stuck=jnp.where(on_sand, params.sand_stuck, 0.0),
             params=params,
         )

@@ -17,9 +17,11 @@ def inside(position: Array, area: Array) -> Array:
 
 def distance(position: Array, area: Array) -> Array:
     """Euclidean distance from `position` (2,) to `area` (4,), 0 inside."""
-    outside = jnp.maximum(jnp.maximum(area[:2] - position, position - area[2:]), 0.0)
-    # the square root's derivative at 0 is infinite: keep it away from there
-    squared = jnp.sum(outside**2)
+    return root(jnp.sum(jnp.maximum(jnp.maximum(area[:2] - position, position - area[2:]), 0.0) ** 2))
+
+
+def root(squared: Array) -> Array:
+    """The square root of `squared` >= 0, with derivative 0 at 0, where it is infinite."""
     return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
 
 
