@@ -25,7 +25,7 @@ from peps_envs.environment import Bounds, Box, Environment, Step
 from peps_envs.navigation.density import NavigationDensity
 from peps_envs.navigation.geometry import SLACK, distance, inside, root, walk
 from peps_envs.navigation.parameters import NavigationParams
-from peps_envs.navigation.scene import agent, ground, view
+from peps_envs.navigation.scene import agent, ground
 from peps_envs.scene import Scene
 
 
@@ -125,4 +125,5 @@ class Navigation(Environment):
 
     def scene(self, state: NavigationState, params: NavigationParams) -> Scene:
         """The ground, and where the agent is on it."""
-        return Scene((*ground(params), agent(state.position)), view(params), y_down=True, background="wall")
+        arena = ground(params)
+        return dataclasses.replace(arena, shapes=(*arena.shapes, agent(state.position)))
