@@ -72,5 +72,10 @@ def test_it_trains_and_is_evaluated(train):
     np.testing.assert_allclose(evaluation.log_belief, -np.sum((0.05 * moves / 0.1) ** 2 / 2, 1), rtol=1e-4)
 
 
+def test_an_environment_owes_no_more_than_this():
+    owed = {"reset", "step", "reward", "perceive", "perception_width"}
+    assert Environment.__abstractmethods__ == owed
+
+
 def test_it_needs_no_picture():
     assert Walk().scene((jnp.zeros(1), 0), Track(0.2)) is None
