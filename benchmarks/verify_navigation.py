@@ -77,7 +77,7 @@ def measure(config: Config) -> dict[str, jax.Array]:
     if config.method == "peps":
         environment, params, belief = config.task()
         rows = jax.tree.map(lambda values: values[:: max(1, values.shape[0] // 3000)], state.replay)
-        place = lambda observation: NavigationState(environment.perceive_observation(observation, params), jnp.int32(0))
+        place = lambda observation: NavigationState(environment.position_of(observation, params), jnp.int32(0))
         felt = jax.vmap(lambda row: sum(synthetic_human.log_weight(
             environment, belief, place(row.observation), row.action, place(row.next_observation))))(rows)  # fmt: skip
         figures["felt"] = felt

@@ -1,6 +1,6 @@
 """Strict by default: warnings are errors (pyproject.toml), arrays of different ranks don't mix, two devices on a CPU.
 
-`Line` and `Probe` are worlds with closed forms, small enough to compile in a moment.
+`Line` and `Probe` are environments with closed forms, small enough to compile in a moment.
 """
 
 import os
@@ -15,7 +15,6 @@ os.environ["PEPS_JAX_CACHE"] = ""  # tests change code, of which what is kept kn
 
 import dataclasses
 import functools
-import math
 from typing import NamedTuple
 
 import distrax
@@ -26,7 +25,7 @@ from flax import struct
 from jax import Array
 
 import peps_jax
-from peps_envs import ActionSpace, Box, Discrete, Environment, NextState, Step
+from peps_envs import ActionSpace, Box, Discrete, Environment, Gaussian, Step
 from peps_jax import Config
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -63,31 +62,6 @@ class Point:
     time: Array
 
 
-@struct.dataclass
-class Gaussian(NextState):
-    """N(mean, noise^2) seen through a kernel N(0, width^2)."""
-
-    mean: Array  # (n,)
-    noise: Array
-    width: Array
-
-    def log_prob(self, perceived: Array) -> Array:
-        variance = self.noise**2 + self.width**2
-        return -0.5 * jnp.sum((perceived - self.mean) ** 2 / variance + jnp.log(2 * math.pi * variance))
-
-    def relative_log_prob(self, perceived: Array) -> Array:
-        return self.log_prob(perceived) + 0.5 * self.mean.size * jnp.log(2 * math.pi * self.width**2)
-
-    def relative_entropy(self) -> Array:
-        return 0.5 * self.mean.size * jnp.log1p(self.noise**2 / self.width**2)
-
-    def sample(self, key: Array) -> Array:
-        return self.mean + jnp.sqrt(self.noise**2 + self.width**2) * jax.random.normal(key, self.mean.shape)
-
-    def quadrature(self, points: int) -> tuple[Array, Array]:
-        raise NotImplementedError
-
-
 @dataclasses.dataclass(frozen=True)
 class Line(Environment):
     """s' = s + 0.1 a + noise xi, r = slope s'. Ends beyond 0.25, and the time is up after `horizon` steps."""
@@ -113,7 +87,7 @@ class Line(Environment):
         return params.slope * next_state.place[0]
 
     def next_state_distribution(self, state: Point, action: Array, params: LineParams) -> Gaussian:
-        return Gaussian(state.place + 0.1 * action, jnp.asarray(params.noise), jnp.asarray(params.width))
+        return Gaussian(state.place + 0.1 * action, jnp.asarray(params.noise), self.perception_width(params))
 
     def perceive(self, state: Point) -> Array:
         return state.place
@@ -163,9 +137,6 @@ class Probe(Environment):
 
     def reward(self, state: Point, action: Array, next_state: Point, params: ProbeParams) -> Array:
         return params.last * (next_state.time >= self.horizon) + params.choice * self.quality(action)
-
-    def next_state_distribution(self, state: Point, action: Array, params: ProbeParams) -> Gaussian:
-        return Gaussian(self._point(state.time + 1).place, jnp.zeros(()), jnp.ones(()))
 
     def perceive(self, state: Point) -> Array:
         return state.place

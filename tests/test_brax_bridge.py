@@ -1,4 +1,4 @@
-"""The worlds as Brax environments, alone and in Brax's own wrappers."""
+"""The environments as Brax environments, alone and in Brax's own wrappers."""
 
 import warnings
 
@@ -35,7 +35,7 @@ def run(env, state, action, steps):
 
 
 @pytest.mark.parametrize("make_key", [jax.random.key, jax.random.PRNGKey])
-def test_shows_what_the_world_does(make_key):
+def test_shows_what_the_environment_does(make_key):
     env = BraxEnvironment(TASK.environment, TASK.params)
     assert (env.observation_size, env.action_size) == (env.environment.observation_size, 2)
     assert isinstance(env.backend, str)
@@ -60,7 +60,7 @@ def test_done_is_terminated_and_the_pit_is_an_event():
     assert not states.info["truncated"].any()
 
 
-def test_the_worlds_horizon_is_reported_and_does_not_end_anything():
+def test_the_environments_horizon_is_reported_and_does_not_end_anything():
     env = BraxEnvironment(navigation.Navigation(horizon=3), TASK.params)
     states = run(env, env.reset(jax.random.PRNGKey(0)), STILL, 3)
     np.testing.assert_array_equal(states.info["truncated"], [False, False, True])
@@ -77,8 +77,8 @@ def test_steps_differ_and_keys_decide():
 
 @pytest.mark.parametrize("episode_length", [4, 7])
 def test_episode_wrapper_calls_time_truncation(episode_length):
-    world = navigation.Navigation(horizon=4)
-    env = training.EpisodeWrapper(BraxEnvironment(world, TASK.params), episode_length, action_repeat=1)
+    short = navigation.Navigation(horizon=4)
+    env = training.EpisodeWrapper(BraxEnvironment(short, TASK.params), episode_length, action_repeat=1)
     states = run(env, env.reset(jax.random.PRNGKey(0)), STILL, episode_length)
     last = np.arange(episode_length) == episode_length - 1
     np.testing.assert_array_equal(states.done, last)
@@ -107,7 +107,7 @@ def test_all_of_brax_training_wrappers():
     assert not states.info["truncation"][:, 0].any()
     ended = states.done == 1
     np.testing.assert_array_equal(states.obs[ended], np.broadcast_to(start[0], states.obs[ended].shape))
-    np.testing.assert_array_equal(states.pipeline_state.time[ended], 0)  # the world's own clock starts again, too
+    np.testing.assert_array_equal(states.pipeline_state.time[ended], 0)  # the environment's own clock starts again, too
     metrics = states.info["episode_metrics"]
     np.testing.assert_array_equal(metrics["pit_reached"][ended[:, 0], 0], 1.0)
     np.testing.assert_array_equal(metrics["length"][ended[:, 1], 1], 5.0)

@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[1]
 # Bottom to top: rooms, and modules where a room has floors of its own. A module imports from the rows below its own, and from
 # its own row. What is named first counts: a module, then the room that it lies in.
 LAYERS = (
+    ("peps_envs.perception", "peps_envs.scene"),
     ("peps_envs.environment",),
     ("peps_envs.navigation", "peps_envs.highway.vehicle"),
     ("peps_envs.highway.collision", "peps_envs.highway.traffic"),
@@ -117,13 +118,21 @@ def test_no_arrow_runs_upwards():
 @pytest.mark.parametrize(
     ("file", "line", "complaint"),
     [
-        ("envs/peps_envs/navigation.py", "import peps_jax.config", "imports peps_jax.config, which is above it"),
+        (
+            "envs/peps_envs/navigation/density.py",
+            "import peps_jax.config",
+            "imports peps_jax.config, which is above it",
+        ),
         (
             "envs/peps_envs/environment.py",
             "from peps_envs.registry import make",
             "imports peps_envs.registry, which is above it",
         ),
-        ("envs/peps_envs/navigation.py", "from . import registry", "imports peps_envs.registry, which is above it"),
+        (
+            "envs/peps_envs/navigation/density.py",
+            "from .. import registry",
+            "imports peps_envs.registry, which is above it",
+        ),
         ("peps_jax/train.py", "from peps_jax import evaluate", "imports peps_jax.evaluate, which is above it"),
         ("peps_jax/train.py", "def late():\n    from .sweep import run", "imports peps_jax.sweep, which is above it"),
         (

@@ -42,18 +42,18 @@ def places(resolution=ALIGNED):
 @partial(jax.jit, static_argnames=("objective", "resolution", "directions"))
 def walk(params, belief, objective, resolution, directions):
     """30 steps of the plan: what each brought, and whether the episode went on until then."""
-    world = Navigation()
+    environment = Navigation()
     plan = navigation_planner.solve(
         params, belief, objective, resolution=resolution, directions=directions, tolerance=0.1
     )
 
     def step(carry, key):
         state, alive = carry
-        action, _ = plan.policy(world.observe(state, params), None)
-        after = world.step(key, state, action, params)
+        action, _ = plan.policy(environment.observe(state, params), None)
+        after = environment.step(key, state, action, params)
         return (after.state, alive & ~after.terminated), (after, alive)
 
-    start, _ = world.reset(jax.random.key(0), params)
+    start, _ = environment.reset(jax.random.key(0), params)
     return jax.lax.scan(step, (start, True), jax.random.split(jax.random.key(0), 30))[1]
 
 

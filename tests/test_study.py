@@ -10,7 +10,8 @@ import pytest
 from commands import exit_code, is_one_complaint
 
 from peps_envs.highway.vehicle import FASTER, IDLE, LANE_LEFT, SLOWER
-from peps_jax.drawing import driving
+from peps_envs.scene import Rectangle
+from peps_jax.drawing import scenes as pictures
 from peps_jax.reproduce.driving import __main__ as command
 from peps_jax.reproduce.driving import comparisons, experiment, participants, ratings, report
 from peps_jax.reproduce.driving import scenes as road_scenes
@@ -171,23 +172,27 @@ def test_groups_of_raters(scenes):
 
 
 def test_pictures(scenes, tmp_path):
-    shown = {name: road_scenes.typical(seen) for name, seen in scenes.items()}
-    driving.strips(shown, "a note").savefig(tmp_path / "strips.png")
-    driving.animate({"steer": shown["steer"]}, tmp_path / "film.gif")
+    shown = {name: pictures.states_of(road_scenes.typical(seen)) for name, seen in scenes.items()}
+    labels = [f"{time} s" for time in report.MOMENTS]
+    pictures.strips(report.clips(shown, report.MOMENTS), labels, "a note").savefig(tmp_path / "strips.png")
+    pictures.film(report.clips({"steer": shown["steer"]}, range(9)), tmp_path / "film.gif", rate=2)
     from PIL import Image
 
     with Image.open(tmp_path / "film.gif") as gif:
-        assert gif.n_frames > 8
+        assert (gif.n_frames, gif.info["duration"]) == (9, 500)
     with Image.open(tmp_path / "strips.png") as picture:
         assert picture.width > picture.height
 
 
 def test_a_moment_lies_between_two_steps(scenes):
-    scene = road_scenes.typical(scenes["steer"])
-    early, middle, late = (driving.moment(scene, time) for time in (1.0, 1.5, 2.0))
-    np.testing.assert_allclose(middle.x, (early.x + late.x) / 2)
-    wreck = driving.moment(road_scenes.typical(scenes["idle"]), 20.0)
-    assert wreck.crashed.all()
+    cars = lambda scene: [shape for shape in scene.shapes if isinstance(shape, Rectangle)]
+    shown = {name: pictures.states_of(road_scenes.typical(scenes[name])) for name in ("steer", "idle")}
+    early, middle, late = (cars(scene) for scene in report.clips(shown, (1.0, 1.5, 2.0))["steer"])
+    for before, now, after in zip(early, middle, late, strict=True):
+        assert now.x == pytest.approx((before.x + after.x) / 2)
+        assert now.angle == pytest.approx((before.angle + after.angle) / 2)
+    (wreck,) = report.clips(shown, [20.0])["idle"]
+    assert [car.colour for car in cars(wreck)] == ["wreck", "wreck"]
 
 
 def test_conduct_counts_seeds_and_leaves_out_who_failed():

@@ -12,7 +12,7 @@ from jax import Array
 from scipy.stats import spearmanr
 
 import peps_envs
-from peps_envs import Discrete, Environment, NextState, Step
+from peps_envs import Discrete, Environment, PerceivedDensity, Step
 from peps_jax import Config, rollout
 from peps_jax.evaluate import evaluate_policy
 from peps_jax.learning import sac, surrogate
@@ -39,7 +39,7 @@ class ChainState:
 
 
 @struct.dataclass
-class Places(NextState):
+class Places(PerceivedDensity):
     """Places so far apart that nobody confuses two of them: l is the logarithm of a probability."""
 
     probabilities: Array
@@ -47,7 +47,7 @@ class Places(NextState):
     def relative_log_prob(self, perceived: Array) -> Array:
         return jnp.log(self.probabilities[perceived[0].astype(jnp.int32)])
 
-    log_prob = relative_entropy = sample = quadrature = None
+    relative_entropy = sample = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What every world offers: code that makes a step, and parameters that say whose dynamics it follows.
+"""What every environment offers: code that makes a step, and parameters that say whose dynamics it follows.
 
 The agent's MDP and the human's share states, actions, start and horizon and differ in dynamics and reward. So an
 `Environment` is code, and what differs is a pytree of parameters: `params` for the true domain, `belief` for the human's.
@@ -12,8 +12,12 @@ import dataclasses
 import math
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
+
+from peps_envs.perception import Gaussian, Mixture, PerceivedDensity
+from peps_envs.scene import Scene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,8 +47,16 @@ class Discrete:
 ActionSpace = Box | Discrete
 
 
+@dataclasses.dataclass(frozen=True)
+class Bounds:
+    """Closed limits of an observation: a number each, or one for every feature; infinite where there is none."""
+
+    low: float | tuple[float, ...] = -math.inf
+    high: float | tuple[float, ...] = math.inf
+
+
 class Step(NamedTuple):
-    """What one step of a world returns. `terminated` and `truncated` are never merged."""
+    """What one step of an environment returns. `terminated` and `truncated` are never merged."""
 
     state: Any  # the next state, a pytree
     observation: Array  # (observation_size,) of the next state
@@ -54,44 +66,18 @@ class Step(NamedTuple):
     events: Array  # (len(event_names),) bool, what happened in this step
 
 
-class NextState(abc.ABC):
-    """Distribution of the next state as perceived: the dynamics T convolved with the kernel K = N(0, sigma_p^2 I).
-
-    Nobody sees a position exactly. Comparing through a kernel keeps every log-density finite, for a deterministic model too,
-    and log K(0) is the base measure that makes a perfect prediction score 0.
-    """
-
-    @abc.abstractmethod
-    def log_prob(self, perceived: Array) -> Array:
-        """log (T * K)(perceived | state, action), for `perceived` of shape (perceived_size,)."""
-
-    @abc.abstractmethod
-    def relative_log_prob(self, perceived: Array) -> Array:
-        """l(s'|s,a) = log (T * K)(s'|s,a) - log K(0) <= 0; 0 where a deterministic model predicts s' exactly."""
-
-    @abc.abstractmethod
-    def relative_entropy(self) -> Array:
-        """Environment entropy against the kernel, sum_i 1/2 log(1 + var_i / sigma_p^2); 0 where T is deterministic."""
-
-    @abc.abstractmethod
-    def sample(self, key: Array) -> Array:
-        """A perceived next state, of shape (perceived_size,)."""
-
-    @abc.abstractmethod
-    def quadrature(self, points: int) -> tuple[Array, Array]:
-        """Weights (n,) that sum to 1 and next states (n, perceived_size): E[f(s')] = sum_k weights[k] f(states[k]), T alone."""
-
-
 class Environment(abc.ABC):
-    """A world as pure functions. Subclasses are frozen dataclasses: equal fields mean the same code, so one compiled program.
+    """An MDP as pure functions. Subclasses are frozen dataclasses: equal fields mean the same code, so one compiled program.
 
-    `horizon` (steps) is part of the code, because it bounds loops. `event_names` names the entries of `Step.events`.
+    What is abstract here is all that an environment owes. `horizon` (steps) is part of the code, because it bounds loops.
     """
 
     horizon: int
     observation_size: int
     action_space: ActionSpace
-    event_names: tuple[str, ...] = ()
+    observation_space: Bounds = Bounds()
+    event_names: tuple[str, ...] = ()  # of the entries of `Step.events`
+    random_draws: int = 1  # steps from which `next_state_distribution` is made; more than one where chance is in them
 
     @abc.abstractmethod
     def reset(self, key: Array, params: Any) -> tuple[Any, Array]:
@@ -106,20 +92,33 @@ class Environment(abc.ABC):
         """r(s, a, s') with the reward weights in `params`: r_A of the true parameters, r_H of a belief."""
 
     @abc.abstractmethod
-    def next_state_distribution(self, state: Any, action: Array, params: Any) -> NextState:
-        """T * K at (state, action), which scores what was perceived."""
-
-    @abc.abstractmethod
     def perceive(self, state: Any) -> Array:
         """The part of a state that people compare, (perceived_size,), in the units of `perception_width`."""
 
     @abc.abstractmethod
-    def perceive_observation(self, observation: Array, params: Any) -> Array:
-        """The same from an observation: an agent that learns dynamics has nothing else."""
-
-    @abc.abstractmethod
     def perception_width(self, params: Any) -> Array:
         """sigma_p, the perceptual kernel's standard deviations, (perceived_size,)."""
+
+    def next_state_distribution(self, state: Any, action: Array, params: Any) -> PerceivedDensity:
+        """T * K at (state, action), which scores what was perceived: the step under `params`, seen through the kernel.
+
+        Exact where a step has no chance in it, l = -1/2 sum(((s' - outcome) / sigma_p)^2). Where it has, `random_draws` steps
+        with fixed keys stand for T as equally likely outcomes: an approximation, in which the same chances are compared at
+        every state and under all parameters. Who knows T better overrides this.
+        """
+        see = lambda key: self.perceive(self.step(key, state, action, params).state)
+        key = jax.random.key(0)
+        if self.random_draws == 1:
+            outcome = see(key)
+            return Gaussian(outcome, jnp.zeros_like(outcome), self.perception_width(params))
+        outcomes = jax.vmap(see)(jax.random.split(key, self.random_draws))
+        weights = jnp.full(self.random_draws, 1 / self.random_draws, outcomes.dtype)
+        return Mixture(outcomes, weights, self.perception_width(params))
+
+    def scene(self, state: Any, params: Any) -> Scene | None:
+        """What there is to see of `state`; None of an environment that has no picture. NumPy in, plain Python out: not traced."""
+        del state, params
+        return None
 
 
 def event(environment: Environment, events: Array, name: str) -> Array:

@@ -1,4 +1,4 @@
-"""Worlds by name."""
+"""Environments by name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from peps_envs.environment import Environment
 
 
 class Task(NamedTuple):
-    """A world with the numbers that make it a task: what is true, and what a human may believe."""
+    """An environment with the numbers that make it a task: what is true, and what a human may believe."""
 
     environment: Environment
     params: Any

@@ -1,4 +1,4 @@
-"""The known-model planner: value iteration on a grid of positions, for worlds whose state is a position in a rectangle.
+"""The known-model planner: value iteration on a grid of positions, for environments whose state is a position in a rectangle.
 
 It knows the dynamics, the belief and the rewards that a training has to learn, so what it reaches is the yardstick:
 
@@ -78,24 +78,24 @@ def solve(
     """
     if objective not in OBJECTIVES:
         raise ValueError(unknown_name("objective", objective, OBJECTIVES))
-    world = Navigation()
+    environment = Navigation()
     acting = belief if objective == "human" else params
     actions = _actions(directions, params.full_action)
 
     def gain(state: NavigationState, action: Array, position: Array) -> Array:
         after = NavigationState(position, state.time + 1)
         if objective == "human":
-            return world.reward(state, action, after, belief)
-        reward = world.reward(state, action, after, params)
+            return environment.reward(state, action, after, belief)
+        reward = environment.reward(state, action, after, params)
         if objective == "return":
             return reward
-        expected = world.next_state_distribution(state, action, belief).relative_log_prob(position)
-        return reward + lam * (world.reward(state, action, after, belief) + expected)
+        expected = environment.next_state_distribution(state, action, belief).relative_log_prob(position)
+        return reward + lam * (environment.reward(state, action, after, belief) + expected)
 
     def consequences(position: Array, action: Array) -> tuple[Array, Array, Array]:
         """The expected reward, and the grid's nodes that follow with their discounted weights, (n,) each."""
         state = NavigationState(position, jnp.zeros((), jnp.int32))
-        after = world.next_state_distribution(state, action, acting)
+        after = environment.next_state_distribution(state, action, acting)
         weights, positions = after.quadrature(points)
         reward = weights @ jax.vmap(lambda position: gain(state, action, position))(positions)
         if objective == "peps":
@@ -120,7 +120,7 @@ def solve(
 
     def policy(observation: Array, key: Array | None) -> tuple[Array, Any]:
         del key  # deterministic
-        position = world.perceive_observation(observation, params)
+        position = environment.position_of(observation, params)
         rewards, index, weights = every_action(position, actions)
         return actions[jnp.argmax(rewards + jnp.sum(weights * values[index], -1))], jnp.zeros(())
 

@@ -7,22 +7,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from peps_envs.navigation import NavigationParams
-from peps_jax.drawing.panels import INK, QUIET, colour_of
+from peps_envs.navigation.scene import ground
+from peps_envs.scene import Rectangle
+from peps_jax.drawing import scenes
+from peps_jax.drawing.panels import INK, QUIET, colour, colour_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FLOOR = "#fbfaf7"
-GROUND = {
-    "wall": "#4a4a4a",
-    "pit": "#9c5a33",
-    "goal": "#57a773",
-    "ice": "#a9d3f0",
-    "sand": "#f6e3a1",
-    "firm sand": "#dfb94f",
-}
-FIRM = 0.5  # gain on sand from which it is drawn as in the paper's D4, darker: the agent can walk on it
+SOLID = ("wall", "pit", "goal")  # what hides a heat map below it; all else is outlined on it
 
 
 def draw_map(axes: Axes, params: NavigationParams, heat: bool = False) -> None:
@@ -30,32 +24,36 @@ def draw_map(axes: Axes, params: NavigationParams, heat: bool = False) -> None:
 
     On a `heat` map ice and sand are outlines, for the heat to be seen.
     """
-    from matplotlib.patches import Rectangle
+    arena = ground(params)
+    scenes.frame(axes, arena)
+    for spine in axes.spines.values():
+        spine.set(visible=True, color=colour("wall"), linewidth=2.5)
+    floor, *areas = arena.shapes
+    if not heat:
+        scenes.add(axes, (floor, *areas))
+        return
+    scenes.add(axes, [area for area in areas if area.colour in SOLID])
+    for area in areas:
+        if area.colour not in SOLID:
+            _outline(axes, area)
+        if area.colour != "wall":
+            _name(axes, area)
+
+
+def _outline(axes: Axes, area: Rectangle) -> None:
+    from matplotlib.patches import Rectangle as Patch
+
+    corner = (area.x - area.width / 2, area.y - area.height / 2)
+    style = dict(fill=False, edgecolor=INK, linewidth=0.9, linestyle=(0, (3, 2)))
+    axes.add_patch(Patch(corner, area.width, area.height, zorder=2, **style))
+
+
+def _name(axes: Axes, area: Rectangle) -> None:
     from matplotlib.patheffects import Normal, Stroke
 
-    width, height = np.asarray(params.size)
-    sand = "firm sand" if params.sand_gain >= FIRM else "sand"
-    areas = [("ice", params.ice), (sand, params.sand), ("pit", params.pit), ("goal", params.goal)]
-    areas += [("wall", wall) for wall in np.asarray(params.walls)]
-    outline = dict(fill=False, edgecolor=INK, linewidth=0.9, linestyle=(0, (3, 2)))
-    if not heat:
-        axes.add_patch(Rectangle((0, 0), width, height, facecolor=FLOOR, linewidth=0, zorder=0))
-    for ground, area in areas:
-        x0, y0, x1, y1 = np.asarray(area)
-        if x1 <= 0 or y1 <= 0:
-            continue  # nowhere
-        seen_through = heat and ground not in ("wall", "pit", "goal")
-        style = outline if seen_through else dict(facecolor=GROUND[ground], linewidth=0)
-        axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, zorder=2 if seen_through else 1, **style))
-        if heat and ground != "wall":
-            place = ((x0 + x1) / 2, (y0 + y1) / 2)
-            halo = [Stroke(linewidth=1.6, foreground=INK, alpha=0.7), Normal()]  # for it to be read on every colour
-            text = dict(ha="center", va="center", fontsize=7, color="white", path_effects=halo)
-            axes.text(*place, ground.split()[-1], zorder=3, **text)
-    axes.set(xlim=(-0.12, width + 0.12), ylim=(height + 0.12, -0.12), aspect="equal", xticks=[], yticks=[])
-    axes.set_facecolor(GROUND["wall"])
-    for spine in axes.spines.values():
-        spine.set(color=GROUND["wall"], linewidth=2.5)
+    halo = [Stroke(linewidth=1.6, foreground=INK, alpha=0.7), Normal()]  # for it to be read on every colour
+    style = dict(ha="center", va="center", fontsize=7, color="white", path_effects=halo)
+    axes.text(area.x, area.y, area.colour.split()[-1], zorder=3, **style)
 
 
 def draw_route(axes: Axes, route: np.ndarray, method: str, alpha: float, width: float = 1.2) -> None:

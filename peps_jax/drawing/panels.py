@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import colorsys
 import io
+import itertools
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,14 +20,25 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, QUIET = "#2b2b2b", "#8a8a8a"
-COLOURS = (
-    "#c2255c",
-    "#1c6dd0",
-    "#e8890c",
-    "#2f9e78",
-    "#7048b6",
-    "#5c6770",
-)  # of methods, in the order they are registered
+ROLES = {  # the colours of what a scene shows, see `peps_envs.scene`; CSS knows them too
+    "ink": INK,
+    "quiet": QUIET,
+    "floor": "#fbfaf7",
+    "wall": "#4a4a4a",
+    "pit": "#9c5a33",
+    "goal": "#57a773",
+    "ice": "#a9d3f0",
+    "sand": "#f6e3a1",
+    "firm sand": "#dfb94f",
+    "road": "#d9d9d6",
+    "edge line": QUIET,
+    "lane line": "#ffffff",
+    "agent": "#2f9e78",
+    "other": "#1c6dd0",
+    "wreck": "#c2255c",
+}
+# of methods, in the order they are registered
+COLOURS = ("#c2255c", "#1c6dd0", "#e8890c", "#2f9e78", "#7048b6", "#5c6770")
 DOTS = 200  # per inch
 
 
@@ -47,9 +61,34 @@ def tidy(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
+def colour(role: str) -> str:
+    """The colour of a role in a scene; any other colour is itself."""
+    return ROLES.get(role, role)
+
+
 def colour_of(method: str) -> str:
     """A method's colour, the same in every figure."""
-    return COLOURS[list(methods.METHODS).index(method) % len(COLOURS)]
+    return colours(list(methods.METHODS).index(method) + 1)[-1]
+
+
+def colours(number: int) -> list[str]:
+    """So many different colours; the first ones are the same for every number."""
+    found = list(COLOURS[:number])
+    for place in itertools.count():
+        if len(found) == number:
+            return found
+        hue = place * (5**0.5 - 1) / 2 % 1  # the golden ratio's multiples never come back to where one was
+        parts = colorsys.hls_to_rgb(hue, (0.3, 0.45, 0.65)[place % 3], 0.75)
+        code = "#" + "".join(f"{round(255 * part):02x}" for part in parts)
+        if (
+            min(_distance(code, other) for other in found) > 0.35 * 0.98**place
+        ):  # the more there are, the nearer they lie
+            found.append(code)
+
+
+def _distance(code: str, other: str) -> float:
+    """Euclidean distance of two colours "#rrggbb", each part from 0 to 1."""
+    return math.dist(*([int(text[place : place + 2], 16) / 255 for place in (1, 3, 5)] for text in (code, other)))
 
 
 def save(figure: Figure, folder: Path, name: str, kinds: Sequence[str] = ("png",)) -> list[Path]:

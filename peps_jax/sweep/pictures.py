@@ -5,22 +5,31 @@ Each function makes one figure, or returns None where it has nothing to show; `d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from peps_envs import Scene
 from peps_envs.navigation import Navigation
 from peps_jax import methods
 from peps_jax.analysis.surrogate_maps import rank_correlation, surrogate_values
+from peps_jax.drawing import scenes
 from peps_jax.drawing.navigation_map import draw_heat, draw_map, draw_route, draw_start
 from peps_jax.drawing.panels import INK, QUIET, colour_of, panels_of, save, tidy
 from peps_jax.sweep.results import PICTURES, Row
+from peps_jax.train import Result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+MOMENTS = 3  # of an episode, in an environment that has a picture of itself
 
 
 def _good(rows: Sequence[Row]) -> list[Row]:
@@ -145,7 +154,7 @@ def _frontier_line(axes: Axes, points: Sequence[Sequence[Row]], method: str) -> 
             axes.annotate(name, place, (0, 7), textcoords="offset points", ha="center", fontsize=7, color=INK)
 
 
-# --- maps -----------------------------------------------------------------------------------------------------------------
+# --- what the agents do ---------------------------------------------------------------------------------------------------
 
 
 def _navigates(row: Row) -> bool:
@@ -153,8 +162,12 @@ def _navigates(row: Row) -> bool:
 
 
 def routes(rows: Sequence[Row], episodes: int = 3) -> Figure | None:
-    """Evaluation routes on the map, a column for each method and lambda: the first `episodes` of every seed."""
-    rows = [row for row in _good(rows) if _navigates(row)]
+    """What the agents do, a row for each environment and a column for each method and lambda.
+
+    In navigation routes on the map, the first `episodes` of every seed; in an environment with a picture of itself moments of one
+    episode; elsewhere the perceived state over time, in the same episodes.
+    """
+    rows = _good(rows)
     if not rows:
         return None
     variant = lambda row: (row.cell.method, row.cell.lam if methods.get(row.cell.method).uses_lam else None)
@@ -167,7 +180,7 @@ def routes(rows: Sequence[Row], episodes: int = 3) -> Figure | None:
             if not members:
                 axes.set_axis_off()
                 continue
-            _routes_panel(axes, list(members.values()), episodes)
+            _panel(axes, list(members.values()), episodes)
             if line == 0:
                 axes.set_title(method if lam is None else _label(method, lam), color=INK, fontsize=10)
             if column == 0:
@@ -175,17 +188,93 @@ def routes(rows: Sequence[Row], episodes: int = 3) -> Figure | None:
     return figure
 
 
+def _panel(axes: Axes, members: Sequence[Row], episodes: int) -> None:
+    """What one method does in one environment, whichever way that can be shown."""
+    if _navigates(members[0]):
+        _routes_panel(axes, members, episodes)
+        return
+    shown = _moments(members[0])
+    if shown:
+        _moments_panel(axes, shown)
+    else:
+        _perceived_panel(axes, members, episodes)
+
+
+def _opacity(members: Sequence[Row]) -> float:
+    return max(0.35, 1 / len(members) ** 0.5)
+
+
 def _routes_panel(axes: Axes, members: Sequence[Row], episodes: int) -> None:
     draw_map(axes, members[0].finished.result.config.task()[1])
     for row in members:
         evaluation = row.finished.evaluation
         for route, length in zip(evaluation.perceived[:episodes], evaluation.length[:episodes], strict=True):
-            draw_route(axes, route[: int(length) + 1], row.cell.method, max(0.35, 1 / len(members) ** 0.5))
+            draw_route(axes, route[: int(length) + 1], row.cell.method, _opacity(members))
     draw_start(axes, members[0].finished.result.config.task()[1])
 
 
+def _moments(row: Row) -> dict[str, Scene]:
+    """Moments of one episode by their times; none of an environment that has no picture."""
+    environment, params, _ = methods.task(row.finished.result.config)
+    start, _ = environment.reset(jax.random.key(0), params)
+    if environment.scene(start, params) is None:
+        return {}
+    states, length = jax.tree.map(np.asarray, _episode(row.finished.result, jax.random.key(0)))
+    times = np.linspace(0, int(length), MOMENTS + 1)[1:].round()
+    shown = scenes.scenes_of(environment, params, states, times)
+    return {f"step {time:.0f}": scene for time, scene in zip(times, shown, strict=True)}
+
+
+@jax.jit
+def _episode(result: Result, key: Any) -> tuple[Any, Any]:
+    """States (horizon + 1, ...) of an episode of `result`, the last one repeated after its end, and the episode's length."""
+    environment, params, _ = methods.task(result.config)
+    policy = result.policy()
+
+    def move(carry: Any, key: Any) -> tuple[Any, Any]:
+        state, observation, alive = carry
+        after = environment.step(key, state, policy(observation, None)[0], params)
+        hold = lambda new, old: jax.tree.map(lambda new, old: jnp.where(alive, new, old), new, old)
+        state, observation = hold((after.state, after.observation), (state, observation))
+        return (state, observation, alive & ~(after.terminated | after.truncated)), (state, alive)
+
+    key_start, key_moves = jax.random.split(key)
+    state, observation = environment.reset(key_start, params)
+    keys = jax.random.split(key_moves, environment.horizon)
+    _, (later, alive) = jax.lax.scan(move, (state, observation, jnp.ones((), bool)), keys)
+    states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state, later)
+    return states, jnp.sum(alive)
+
+
+def _moments_panel(axes: Axes, shown: Mapping[str, Scene]) -> None:
+    """Scenes below one another, by their times."""
+    axes.set(xticks=[], yticks=[])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    share = 1 / len(shown)
+    for place, (time, scene) in enumerate(shown.items()):
+        inset = axes.inset_axes((0.0, 1 - (place + 1) * share, 1.0, 0.9 * share))
+        scenes.draw(inset, scene)
+        inset.set_title(time, color=QUIET, fontsize=7, loc="left", pad=2)
+
+
+def _perceived_panel(axes: Axes, members: Sequence[Row], episodes: int) -> None:
+    """How far each part of the perceived state is from where it started, in perceptual widths, a style of line for each."""
+    tidy(axes)
+    environment, params, _ = members[0].finished.result.config.task()
+    width = np.asarray(environment.perception_width(params))
+    for row in members:
+        evaluation = row.finished.evaluation
+        for perceived, length in zip(evaluation.perceived[:episodes], evaluation.length[:episodes], strict=True):
+            seen = np.asarray(perceived[: int(length) + 1])
+            for part, style in zip(((seen - seen[:1]) / width[None]).T, itertools.cycle(("-", "--", ":", "-."))):
+                colour = colour_of(row.cell.method)
+                axes.plot(part, style, color=colour, linewidth=1.2, alpha=_opacity(members))
+    axes.set_xlabel("step; perceived state, σ_p from its start", color=QUIET, fontsize=7)
+
+
 def surrogate_maps(rows: Sequence[Row]) -> Figure | None:
-    """r_hat as a heat map beside the true l_H + r_H, for the first seed of each world and method that learned one."""
+    """r_hat as a heat map beside the true l_H + r_H, for the first seed of each environment and method that learned one."""
     rows = [row for row in _good(rows) if _navigates(row) and hasattr(row.finished.result.knowledge, "surrogate")]
     if not rows:
         return None

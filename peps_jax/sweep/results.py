@@ -4,7 +4,7 @@
     results.csv      one row for each cell of the grid
     curves.npz       `env_steps` (rounds,), and every curve (cells, rounds) in the order of the rows; nan where a method has none
     cells/*.msgpack  what each training learned and how it was evaluated, behind a line with the file's checksum
-    *.png            pictures, see `peps_jax.drawing.figures`
+    *.png            pictures, see `peps_jax.sweep.pictures`
     progress/        how far an unfinished sweep is, see `peps_jax.sweep.journal`
     .owner/          whose the folder is while it is written, see `peps_jax.storage.ownership`
 

@@ -1,4 +1,4 @@
-"""Worlds as Brax environments. Importing this module imports Brax; nothing else here does.
+"""Environments of this package as Brax environments. Importing this module imports Brax; nothing else here does.
 
     from brax.envs.wrappers import training
 
@@ -6,13 +6,13 @@
     env = training.wrap(BraxEnvironment(task.environment, task.params), episode_length=task.environment.horizon)
 
 `done` says *terminated* alone. Time is Brax's own business: its `EpisodeWrapper` ends episodes at `episode_length` and writes
-`info["truncation"]`, which is right only if nobody has counted time into `done` before. What the world says is in `info`:
+`info["truncation"]`, which is right only if nobody has counted time into `done` before. What the environment says is in `info`:
 
     info["terminated"]  the MDP ended,
-    info["truncated"]   the world's own horizon is reached or passed; the episode goes on until a wrapper ends it,
+    info["truncated"]   the environment's own horizon is reached or passed; the episode goes on until a wrapper ends it,
     info["key"]         the random key of the next step.
 
-`metrics` holds the world's events as 0.0 or 1.0, so that Brax's wrappers count them per episode.
+`metrics` holds the environment's events as 0.0 or 1.0, so that Brax's wrappers count them per episode.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class BraxEnvironment(Env):
         return self._state(start, key, State(None, observation, start.reward, no))
 
     def step(self, state: State, action: Array) -> State:
-        # the key isn't part of the world's state: AutoResetWrapper puts that back, and every episode would repeat the first
+        # the key isn't part of the environment's state: AutoResetWrapper puts that back, and every episode would repeat the first
         key, key_step = jax.random.split(state.info["key"])
         after = self.environment.step(key_step, state.pipeline_state, action, self.params)
         return self._state(after, key, state)

@@ -22,11 +22,13 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from peps_envs.environment import Discrete, Environment, NextState, Step
-from peps_envs.highway import classic, traffic, vehicle
+from peps_envs.environment import Bounds, Discrete, Environment, Step
+from peps_envs.highway import classic, scene, traffic, vehicle
 from peps_envs.highway.simulation import Physics, Road, advance
 from peps_envs.highway.traffic import Drivers
-from peps_envs.highway.vehicle import LANE_WIDTH, LENGTH, WIDTH, Vehicles
+from peps_envs.highway.vehicle import LANE_WIDTH, LENGTH, MAX_SPEED, WIDTH, Vehicles
+from peps_envs.perception import Mixture
+from peps_envs.scene import Scene
 
 START = 100.0  # m, where the ego starts
 CUT = 2.0  # standard deviations at which the friction coefficient's distribution is clipped
@@ -101,40 +103,6 @@ def friction_nodes(points: int) -> np.ndarray:
     return medians * np.sqrt(variance / np.mean(medians**2)) if points > 1 else medians
 
 
-@struct.dataclass
-class HighwayNextState(NextState):
-    """The next perceived state: equally likely outcomes of the road's friction, seen through the kernel.
-
-    (T * K)(s'|s,a) = 1/n sum_k N(s'; outcome_k, sigma_p^2).
-    """
-
-    outcomes: Array  # (n, 3)
-    width: Array  # (3,) sigma_p
-
-    def log_prob(self, perceived: Array) -> Array:
-        return self._log_ratio(perceived) - jnp.sum(jnp.log(self.width) + 0.5 * math.log(2 * math.pi))
-
-    def relative_log_prob(self, perceived: Array) -> Array:
-        return jnp.minimum(self._log_ratio(perceived), 0.0)  # rounding must not make it positive
-
-    def _log_ratio(self, perceived: Array) -> Array:
-        distances = (perceived[None] - self.outcomes) / self.width[None]
-        return jax.nn.logsumexp(-0.5 * jnp.sum(distances**2, axis=1)) - math.log(self.outcomes.shape[0])
-
-    def relative_entropy(self) -> Array:
-        return 0.5 * jnp.sum(jnp.log1p(jnp.var(self.outcomes, axis=0) / self.width**2))
-
-    def sample(self, key: Array) -> Array:
-        key_friction, key_see = jax.random.split(key)
-        outcome = self.outcomes[jax.random.randint(key_friction, (), 0, self.outcomes.shape[0])]
-        return outcome + self.width * jax.random.normal(key_see, self.width.shape)
-
-    def quadrature(self, points: int) -> tuple[Array, Array]:
-        del points  # the outcomes are simulated, so there are as many as the environment was made with
-        number = self.outcomes.shape[0]
-        return jnp.full(number, 1 / number, self.outcomes.dtype), self.outcomes
-
-
 @dataclasses.dataclass(frozen=True)
 class Highway(Environment):
     """Avoid the car that brakes; see the module's text. Events: `crashed`, `changed_lane`."""
@@ -157,6 +125,26 @@ class Highway(Environment):
     @property
     def observation_size(self) -> int:
         return EGO_FEATURES + OTHER_FEATURES * (1 + self.traffic)
+
+    @property
+    def observation_space(self) -> Bounds:
+        """Speeds up to what slows a car down, places on the road, headings that steering aims at.
+
+        How far away others are and how hard they brake is the scenario's business: it has no bounds here.
+        """
+        lanes, speed = float(self.lanes), MAX_SPEED / SPEED_SCALE
+        heading = math.pi / 4 / HEADING_SCALE
+        own = [
+            (0.0, speed),
+            (-0.5, lanes - 0.5),
+            (-heading, heading),
+            (0.0, lanes - 1.0),
+            (0.0, speed),
+            (0.0, 1.0),
+        ]
+        theirs = [(-math.inf, math.inf), (-lanes, lanes), (-speed, speed), (0.0, math.inf)]
+        low, high = zip(*own, *theirs * (1 + self.traffic), strict=True)
+        return Bounds(low, high)
 
     def reset(self, key: Array, params: HighwayParams) -> tuple[HighwayState, Array]:
         key_speed, key_gap, key_deceleration, key_onset, key_spacing, key_wait = jax.random.split(key, 6)
@@ -262,13 +250,14 @@ class Highway(Environment):
             - (params.lane_change_cost + params.swerve_cost * haste) * sideways
         )
 
-    def next_state_distribution(self, state: HighwayState, action: Array, params: HighwayParams) -> HighwayNextState:
+    def next_state_distribution(self, state: HighwayState, action: Array, params: HighwayParams) -> Mixture:
+        """Equally likely outcomes of the road's friction, seen through the kernel."""
         friction = params.physics.friction
         nodes = jnp.asarray(friction_nodes(self.friction_points), friction.mean.dtype)
         outcome = lambda mu: self.perceive(self.advance(state, action, mu, params))
-        return HighwayNextState(
-            outcomes=jax.vmap(outcome)(friction.mean + friction.sd * nodes), width=params.perception_width
-        )
+        outcomes = jax.vmap(outcome)(friction.mean + friction.sd * nodes)
+        weights = jnp.full(self.friction_points, 1 / self.friction_points, outcomes.dtype)
+        return Mixture(outcomes, weights, params.perception_width)
 
     def observe(self, state: HighwayState) -> Array:
         """Nothing saturates, and with the time it is all that matters until the car in front brakes.
@@ -309,6 +298,10 @@ class Highway(Environment):
     def perception_width(self, params: HighwayParams) -> Array:
         return params.perception_width
 
+    def scene(self, state: HighwayState, params: HighwayParams) -> Scene:
+        """The road around the ego, and the cars on it."""
+        return scene.road_scene(state.vehicles, self.lanes)
+
 
 @dataclasses.dataclass(frozen=True)
 class ClassicHighway(Highway):
@@ -318,6 +311,7 @@ class ClassicHighway(Highway):
     """
 
     observation_size = classic.ROWS * classic.COLUMNS
+    observation_space = Bounds(-1.0, 1.0)
 
     def reward(self, state: HighwayState, action: Array, next_state: HighwayState, params: HighwayParams) -> Array:
         return classic.reward(next_state.vehicles, self.lanes)

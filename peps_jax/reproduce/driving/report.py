@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from peps_jax.drawing import driving
+import peps_envs
+from peps_jax.drawing import scenes as pictures
 from peps_jax.reproduce.driving.experiment import SETTINGS, Conduct, Findings
 from peps_jax.reproduce.driving.ratings import RATERS, Group
-from peps_jax.reproduce.driving.scenes import BEHAVIOURS, typical
+from peps_jax.reproduce.driving.scenes import BEHAVIOURS, HORIZON, RAIN, typical
 from peps_jax.storage import files
 from peps_jax.storage.tables import markdown
 
+MOMENTS = (1.0, 3.0, 5.0)  # s after the start, of the paper's Figure 3
+RATE = 6  # pictures of the film for a second of the scene
 PICTURE, FILM, NUMBERS, TABLE = "figure3.png", "figure3.gif", "figure3.json", "figure3.md"
 TITLES = {"peps": "PEPS", "sac": "SAC", "drlhp": "DRLHP", "policy_shaping": "policy shaping"}
 # Gong and Zhang 2021, Figure 3: mean and standard deviation of 15 ratings; p = 0.037
@@ -88,6 +91,12 @@ def text(findings: Findings) -> str:
     return "\n".join(parts)
 
 
+def clips(shown: Mapping[str, Any], times: Sequence[float]) -> dict[str, list[peps_envs.Scene]]:
+    """What there is to see of each title's states (moments, ...) at `times` (s, a policy step each)."""
+    task = peps_envs.make(RAIN)
+    return {title: pictures.scenes_of(task.environment, task.params, states, times) for title, states in shown.items()}
+
+
 def write(findings: Findings, folder: Path) -> list[Path]:
     """Writes figure3.png, .gif, .json and .md; returns the paths."""
     rated = (findings.wider or findings.groups)[0]
@@ -95,11 +104,14 @@ def write(findings: Findings, folder: Path) -> list[Path]:
         method: f"{TITLES[method]} (μ = {rated.mean[method]:.1f}, σ = {rated.sd[method]:.1f})"
         for method in findings.scenes
     }
-    shown = {titles[method]: typical(scenes) for method, scenes in findings.scenes.items()}
+    shown = {titles[method]: pictures.states_of(typical(scenes)) for method, scenes in findings.scenes.items()}
     files.make_folder(folder)
     note = f"ratings by simulated participants; one-way ANOVA: p = {rated.p:.2g}"
-    files.write_with(folder / PICTURE, lambda path: driving.strips(shown, note).savefig(path, dpi=150))
-    files.write_with(folder / FILM, lambda path: driving.animate(shown, path))
+    labels = [f"{time:g} s" for time in MOMENTS]
+    strips = pictures.strips(clips(shown, MOMENTS), labels, note)
+    files.write_with(folder / PICTURE, lambda path: strips.savefig(path, dpi=150))
+    times = np.arange(0, HORIZON + 0.5, 1 / RATE)
+    files.write_with(folder / FILM, lambda path: pictures.film(clips(shown, times), path, RATE))
     numbers = json.dumps(summary(findings), indent=1, allow_nan=False) + "\n"
     files.write_whole(folder / NUMBERS, numbers.encode())
     files.write_whole(folder / TABLE, text(findings).encode())

@@ -1,0 +1,145 @@
+"""Scenes of any environment with matplotlib: a moment, strips of several, films. It is imported on the first one drawn.
+
+A clip is a sequence of scenes; what they show is `peps_envs.scene`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from peps_envs import Environment
+from peps_envs.scene import Circle, Polyline, Rectangle, Scene, Shape, Text
+from peps_jax.drawing.panels import INK, colour, panels_of
+from peps_jax.trajectory import Segments
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+OUTLINE, LINE = 0.6, 1.2  # points, widths of lines
+TITLE = 0.45  # inches between one scene and the next, for what is written there
+
+
+def states_of(segment: Segments) -> Any:
+    """The states of one `segment` (steps, ...) from its first to that of its end: (moments, ...)."""
+    steps = int(np.sum(segment.mask))
+    return jax.tree.map(
+        lambda before, after: np.concatenate([before[:steps], after[steps - 1 : steps]]),
+        segment.state,
+        segment.next_state,
+    )
+
+
+def scenes_of(environment: Environment, params: Any, states: Any, times: Sequence[float]) -> list[Scene]:
+    """What there is to see of `states` (moments, ...) at `times`, in steps and parts of them; as it ended after the end."""
+    last = len(jax.tree.leaves(states)[0]) - 1
+    scenes = []
+    for time in times:
+        before = min(int(time), last)
+        row = lambda place: jax.tree.map(lambda leaf: leaf[place], states)
+        state = between(row(before), row(min(before + 1, last)), min(time, last) - before)
+        scenes.append(environment.scene(state, params))
+    return scenes
+
+
+def between(before: Any, after: Any, share: float) -> Any:
+    """A state `share` of the way between two: real numbers by interpolation, all else as it was before."""
+
+    def mix(old: Any, new: Any) -> Any:
+        if not jnp.issubdtype(old.dtype, jnp.floating):
+            return old
+        with np.errstate(invalid="ignore"):  # what is infinite before and after stays so
+            return np.where(old == new, old, (1 - share) * np.asarray(old, float) + share * np.asarray(new, float))
+
+    return jax.tree.map(mix, before, after)
+
+
+def draw(axes: Axes, scene: Scene) -> None:
+    """`scene` in place of all that was on `axes`."""
+    axes.clear()
+    frame(axes, scene)
+    add(axes, scene.shapes)
+
+
+def frame(axes: Axes, scene: Scene) -> None:
+    """The view of `scene`, without its shapes: limits, background, no ticks."""
+    left, right, low, high = scene.extent
+    bottom, top = (high, low) if scene.y_down else (low, high)
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
+    axes.set_facecolor(colour(scene.background))
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def add(axes: Axes, shapes: Sequence[Shape]) -> None:
+    """`shapes` over one another in their order, above heat maps (0) and below what is drawn on top (from 2 on)."""
+    for place, shape in enumerate(shapes):
+        _add(axes, shape, 1 + place / len(shapes))
+
+
+def _add(axes: Axes, shape: Shape, order: float) -> None:
+    from matplotlib import patches
+
+    match shape:
+        case Rectangle():
+            corner = (shape.x - shape.width / 2, shape.y - shape.height / 2)
+            turned = dict(angle=np.degrees(shape.angle), rotation_point="center", zorder=order)
+            axes.add_patch(patches.Rectangle(corner, shape.width, shape.height, **turned, **_style(shape)))
+        case Circle():
+            axes.add_patch(patches.Circle((shape.x, shape.y), shape.radius, zorder=order, **_style(shape)))
+        case Polyline():
+            axes.plot(*np.transpose(shape.points), color=colour(shape.colour), linewidth=LINE, zorder=order)
+        case Text():
+            style = dict(ha="center", va="center", fontsize=7, clip_on=True, zorder=order)
+            axes.text(shape.x, shape.y, shape.text, color=colour(shape.colour), **style)
+
+
+def _style(shape: Rectangle | Circle) -> dict[str, Any]:
+    if shape.outline is None:
+        return dict(facecolor=colour(shape.colour), linewidth=0)
+    return dict(facecolor=colour(shape.colour), edgecolor=colour(shape.outline), linewidth=OUTLINE)
+
+
+def strips(clips: Mapping[str, Sequence[Scene]], labels: Sequence[str], note: str = "") -> Figure:
+    """A column for each clip, by its title, and a row for each of its scenes, by its label."""
+    figure, grid = panels_of(len(labels), len(clips), 3.2, 3.2 * _slope(clips) + TITLE)
+    for column, (title, clip) in enumerate(clips.items()):
+        for axes, scene, label in zip(grid[:, column], clip, labels, strict=True):
+            draw(axes, scene)
+            axes.set_ylabel(label if column == 0 else "", color=INK, fontsize=8)
+        grid[0, column].set_title(title, color=INK, fontsize=9)
+    if note:
+        figure.supxlabel(note, color=INK, fontsize=8)
+    return figure
+
+
+def film(clips: Mapping[str, Sequence[Scene]], path: Path, rate: float) -> None:
+    """Writes a GIF of `rate` scenes a second: the clips below one another, by their titles; who is done before stands still."""
+    from PIL import Image
+
+    figure, grid = panels_of(len(clips), 1, 6.0, 6.0 * _slope(clips) + TITLE)
+    pictures = []
+    for place in range(max(map(len, clips.values()))):
+        for axes, (title, clip) in zip(grid[:, 0], clips.items(), strict=True):
+            draw(axes, clip[min(place, len(clip) - 1)])
+            axes.set_title(title, color=INK, fontsize=9, loc="left")
+        if not pictures:
+            figure.canvas.draw()
+            figure.canvas.draw()  # the layout has settled after the second time; from then on nothing may jump
+            figure.set_layout_engine("none")
+        figure.canvas.draw()
+        pictures.append(Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()))
+    first, *rest = pictures
+    first.save(path, save_all=True, append_images=rest, duration=round(1000 / rate), loop=0)
+
+
+def _slope(clips: Mapping[str, Sequence[Scene]]) -> float:
+    """Height by width of the highest scene in view."""
+    extents = (scene.extent for clip in clips.values() for scene in clip)
+    return max((high - low) / (right - left) for left, right, low, high in extents)
