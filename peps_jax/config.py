@@ -1,13 +1,17 @@
-"""Settings of a training: one frozen pytree.
+"""Settings of a training, as users write them: one flat, frozen pytree.
 
 What changes shapes or program structure is static: `jax.jit(train)` compiles once for each. Everything else is a traced leaf,
-so `jax.vmap(train)` takes a `Config` with batched leaves.
+so `jax.vmap(train)` takes a `Config` with batched leaves. A field's metadata has its help text, its group and what values are
+right; checks and command-line flags follow from it.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+import math
+import numbers
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +23,39 @@ from peps_envs.registry import unknown_name
 
 STRATEGIES = ("information_gain", "disagreement", "random")
 LEVELS = ("none", "quantile", "max", "standard")
+MOST = 2**31 - 1  # of whole numbers: sizes and seeds are 32-bit
 
 
-def _static(default: Any, text: str, **metadata: Any) -> Any:
-    return struct.field(pytree_node=False, default=default, metadata={"help": text, **metadata})
+class Right(NamedTuple):
+    """What values of a setting make sense, as a test of one value and as words."""
+
+    holds: Callable[[Any], Any]
+    words: str
 
 
-def _traced(default: Any, text: str, **metadata: Any) -> Any:
-    return struct.field(default=default, metadata={"help": text, **metadata})
+NOT_NEGATIVE = Right(lambda value: (value >= 0) & np.isfinite(value), "0 or more")
+POSITIVE = Right(lambda value: (value > 0) & np.isfinite(value), "above 0")
+SHARE = Right(lambda value: (value >= 0) & (value <= 1), "from 0 to 1")
+COUNT = Right(lambda value: (value >= 1) & (value <= MOST), f"a whole number from 1 to {MOST}")
+COUNT_OR_NONE = Right(lambda value: (value >= 0) & (value <= MOST), f"a whole number from 0 to {MOST}")
+SIZES = Right(lambda value: COUNT.holds(value), f"one or more sizes, whole numbers from 1 to {MOST}")
+FLOOR = Right(lambda value: value < np.inf, "a number, or -inf for none")
+SWITCH = Right(lambda value: value is True or value is False, "True or False")
+
+
+def _one_of(choices: tuple[str, ...]) -> Right:
+    return Right(lambda value: value in choices, ", ".join(choices))
+
+
+def _static(default: Any, right: Right | tuple[str, ...] | None, text: str, **metadata: Any) -> Any:
+    choices = right if isinstance(right, tuple) and not isinstance(right, Right) else None
+    right = right if choices is None else _one_of(choices)
+    metadata |= {"help": text, "right": right, "choices": choices}
+    return struct.field(pytree_node=False, default=default, metadata=metadata)
+
+
+def _traced(default: Any, right: Right | None, text: str, **metadata: Any) -> Any:
+    return struct.field(default=default, metadata={"help": text, "right": right, "choices": None, **metadata})
 
 
 @struct.dataclass
@@ -37,78 +66,102 @@ class Config:
     task knows ("biased", "unbiased", ...) or a pytree of parameters. `check()` raises ValueError for values that make no sense.
     """
 
-    env: Any = _static("nav-d1", "the world", group="task")
+    env: Any = _static("nav-d1", None, "the environment", group="task")
     method: str = _static(
         "peps",
+        None,
         "what is learned, and from which reward: peps, sac, drlhp, policy_shaping or human_expectation",
         group="task",
     )
-    seed: Any = _traced(0, "random seed", group="task")
-    params: Any = _traced(None, "true parameters of the world (default: the task's)", group="task", flag=False)
-    belief: Any = _traced(None, "what the human believes (default: the task's first belief)", group="task")
+    seed: Any = _traced(0, COUNT_OR_NONE, "random seed", group="task")
+    params: Any = _traced(
+        None, None, "true parameters of the environment (default: the task's)", group="task", flag=False
+    )
+    belief: Any = _traced(None, None, "what the human believes (default: the task's first belief)", group="task")
 
     # Eq. (6)
-    lam: Any = _traced(2.4, "reconciliation parameter: weight of explicability against return", group="objective")
-    surrogate_weight: Any = _traced(1.0, "weight of the surrogate reward in Eq. (6)", group="objective")
-    environment_entropy_weight: Any = _traced(1.0, "weight of the environment entropy in Eq. (6)", group="objective")
-    policy_entropy_weight: Any = _traced(0.3, "weight of the policy entropy in Eq. (6)", group="objective")
-    gamma: Any = _traced(0.995, "discount", group="objective")
+    lam: Any = _traced(
+        2.4, NOT_NEGATIVE, "reconciliation parameter: weight of explicability against return", group="objective"
+    )
+    surrogate_weight: Any = _traced(1.0, NOT_NEGATIVE, "weight of the surrogate reward in Eq. (6)", group="objective")
+    environment_entropy_weight: Any = _traced(
+        1.0, NOT_NEGATIVE, "weight of the environment entropy in Eq. (6)", group="objective"
+    )
+    policy_entropy_weight: Any = _traced(
+        0.3, NOT_NEGATIVE, "weight of the policy entropy in Eq. (6)", group="objective"
+    )
+    gamma: Any = _traced(0.995, SHARE, "discount", group="objective")
 
-    total_steps: int = _static(40_000, "environment steps in all", group="run")
-    num_envs: int = _static(16, "environments side by side", group="run")
-    rollout_length: int = _static(25, "steps that each environment makes in a round", group="run")
-    warmup_steps: int = _static(3_200, "environment steps with uniformly random actions at the start", group="run")
-    exploration: Any = _traced(0.2, "share of the steps after that with such actions", group="run")
-    hold_steps: int = _static(5, "steps for which such an action is held", group="run")
+    total_steps: int = _static(40_000, COUNT, "environment steps in all", group="run")
+    num_envs: int = _static(16, COUNT, "environments side by side", group="run")
+    rollout_length: int = _static(25, COUNT, "steps that each environment makes in a round", group="run")
+    warmup_steps: int = _static(
+        3_200, COUNT_OR_NONE, "environment steps with uniformly random actions at the start", group="run"
+    )
+    exploration: Any = _traced(0.2, SHARE, "share of the steps after that with such actions", group="run")
+    hold_steps: int = _static(5, COUNT, "steps for which such an action is held", group="run")
 
-    learning_rate: Any = _traced(1e-3, "Adam's rate for policy and critics", group="sac")
+    learning_rate: Any = _traced(1e-3, POSITIVE, "Adam's rate for policy and critics", group="sac")
     fade_share: Any = _traced(
-        0.3, "share of the rounds, at the end, over which that rate falls to a tenth", group="sac"
+        0.3, SHARE, "share of the rounds, at the end, over which that rate falls to a tenth", group="sac"
     )
     temperature: Any = _traced(
-        0.02, "weight of the policy entropy beside Eq. (6)'s, at the end (in reward units)", group="sac"
+        0.02, NOT_NEGATIVE, "weight of the policy entropy beside Eq. (6)'s, at the end (in reward units)", group="sac"
     )
-    initial_temperature: Any = _traced(3.0, "the same at the start: exploration fades", group="sac")
-    anneal_share: Any = _traced(0.8, "share of the rounds over which the temperature fades", group="sac")
-    saturation_penalty: Any = _traced(0.02, "price of a squared action before tanh (in reward units)", group="sac")
-    tune_temperature: bool = _static(False, "tune the temperature to a target entropy instead", group="sac")
-    target_rate: Any = _traced(0.01, "share of the critics that the targets take over at an update", group="sac")
-    reward_scale: Any = _traced(0.1, "what rewards are multiplied by before the critics see them", group="sac")
-    updates_per_step: float = _static(0.25, "SAC updates per environment step", group="sac")
-    batch_size: int = _static(256, "transitions in a minibatch", group="sac")
-    hidden_sizes: tuple[int, ...] = _static((64, 64), "hidden layers of policy and critics", group="sac")
+    initial_temperature: Any = _traced(3.0, NOT_NEGATIVE, "the same at the start: exploration fades", group="sac")
+    anneal_share: Any = _traced(0.8, SHARE, "share of the rounds over which the temperature fades", group="sac")
+    saturation_penalty: Any = _traced(
+        0.02, NOT_NEGATIVE, "price of a squared action before tanh (in reward units)", group="sac"
+    )
+    tune_temperature: bool = _static(False, SWITCH, "tune the temperature to a target entropy instead", group="sac")
+    target_rate: Any = _traced(0.01, SHARE, "share of the critics that the targets take over at an update", group="sac")
+    reward_scale: Any = _traced(
+        0.1, POSITIVE, "what rewards are multiplied by before the critics see them", group="sac"
+    )
+    updates_per_step: float = _static(0.25, POSITIVE, "SAC updates per environment step", group="sac")
+    batch_size: int = _static(256, COUNT, "transitions in a minibatch", group="sac")
+    hidden_sizes: tuple[int, ...] = _static((64, 64), SIZES, "hidden layers of policy and critics", group="sac")
 
-    ensemble_size: int = _static(5, "members of the dynamics and of the surrogate ensemble", group="models")
+    ensemble_size: int = _static(5, COUNT, "members of the dynamics and of the surrogate ensemble", group="models")
     model_hidden_sizes: tuple[int, ...] = _static(
-        (32, 32), "hidden layers of dynamics and surrogate networks", group="models"
+        (32, 32), SIZES, "hidden layers of dynamics and surrogate networks", group="models"
     )
-    dynamics_learning_rate: Any = _traced(1e-3, "Adam's rate for the dynamics", group="models")
-    dynamics_updates: int = _static(20, "gradient steps on the dynamics in a round", group="models")
-    surrogate_learning_rate: Any = _traced(5e-3, "Adam's rate for the surrogate reward", group="models")
-    surrogate_updates: int = _static(40, "gradient steps on the surrogate reward in a round", group="models")
-    surrogate_batch_size: int = _static(64, "preferences in a minibatch of the surrogate's fit", group="models")
-    surrogate_decay: Any = _traced(1e-4, "weight decay of the surrogate's fit", group="models")
+    dynamics_learning_rate: Any = _traced(1e-3, POSITIVE, "Adam's rate for the dynamics", group="models")
+    dynamics_updates: int = _static(20, COUNT, "gradient steps on the dynamics in a round", group="models")
+    surrogate_learning_rate: Any = _traced(5e-3, POSITIVE, "Adam's rate for the surrogate reward", group="models")
+    surrogate_updates: int = _static(40, COUNT, "gradient steps on the surrogate reward in a round", group="models")
+    surrogate_batch_size: int = _static(64, COUNT, "preferences in a minibatch of the surrogate's fit", group="models")
+    surrogate_decay: Any = _traced(1e-4, NOT_NEGATIVE, "weight decay of the surrogate's fit", group="models")
     level: str = _static(
-        "none", f"what pins the surrogate reward's level after the fit: {', '.join(LEVELS)}", group="models"
+        "none", LEVELS, f"what pins the surrogate reward's level after the fit: {', '.join(LEVELS)}", group="models"
     )
 
-    num_queries: int = _static(3_000, "preferences that the teacher gives in all", group="queries")
-    segment_length: int = _static(5, "steps of the longest segment", group="queries")
+    num_queries: int = _static(3_000, COUNT, "preferences that the teacher gives in all", group="queries")
+    segment_length: int = _static(5, COUNT, "steps of the longest segment", group="queries")
     min_segment_length: int = _static(
-        2, "steps of the shortest segment (unequal lengths pin the level)", group="queries"
+        2, COUNT, "steps of the shortest segment (unequal lengths pin the level)", group="queries"
     )
     query_strategy: str = _static(
-        "information_gain", f"how queries are chosen: {', '.join(STRATEGIES)}", group="queries"
+        "information_gain", STRATEGIES, f"how queries are chosen: {', '.join(STRATEGIES)}", group="queries"
     )
-    candidates_per_query: int = _static(10, "candidate pairs for each query asked", group="queries")
+    candidates_per_query: int = _static(
+        10,
+        Right(lambda value: COUNT.holds(value) & (value >= 10), "10 or more, or the choice is no choice"),
+        "candidate pairs for each query asked",
+        group="queries",
+    )
 
-    rationality: Any = _traced(1.0, "the human's coefficient on the difference in Eq. (2)'s exponents", group="human")
-    myopia: Any = _traced(
-        1.0, "discount towards a segment's past: below 1 the human weighs its end more", group="human"
+    rationality: Any = _traced(
+        1.0, NOT_NEGATIVE, "the human's coefficient on the difference in Eq. (2)'s exponents", group="human"
     )
-    mistake_rate: Any = _traced(0.0, "probability of the opposite answer", group="human")
-    indifference: Any = _traced(0.0, "difference below which the human calls it a tie", group="human")
-    skip_below: Any = _traced(-np.inf, "sum under which both segments make the human skip the query", group="human")
+    myopia: Any = _traced(
+        1.0, SHARE, "discount towards a segment's past: below 1 the human weighs its end more", group="human"
+    )
+    mistake_rate: Any = _traced(0.0, SHARE, "probability of the opposite answer", group="human")
+    indifference: Any = _traced(0.0, NOT_NEGATIVE, "difference below which the human calls it a tie", group="human")
+    skip_below: Any = _traced(
+        -math.inf, FLOOR, "sum under which both segments make the human skip the query", group="human"
+    )
 
     def __post_init__(self):
         if isinstance(self.belief, str):
@@ -145,6 +198,7 @@ class Config:
 
     @property
     def warmup_rounds(self) -> int:
+        """Rounds whose actions are all random."""
         return -(-self.warmup_steps // self.steps_per_round)
 
     @property
@@ -158,31 +212,15 @@ class Config:
         return -(-self.num_queries // self.num_rounds)
 
     def check(self) -> None:
-        """Raises ValueError, in one line, for the first field whose value makes no sense. Traced values are not looked at."""
-        self.task()
-        _check_choice("query_strategy", self.query_strategy, STRATEGIES)
-        _check_choice("level", self.level, LEVELS)
-        for name in (
-            "total_steps", "num_envs", "rollout_length", "batch_size", "ensemble_size", "dynamics_updates",
-            "surrogate_updates", "surrogate_batch_size", "num_queries", "segment_length", "min_segment_length",
-            "candidates_per_query", "hold_steps",
-        ):  # fmt: skip
-            _require(
-                name,
-                getattr(self, name),
-                lambda value: isinstance(value, int) and value >= 1,
-                "a whole number from 1 on",
-            )
-        _require("warmup_steps", self.warmup_steps, lambda value: value >= 0, "0 or more")
-        _require("updates_per_step", self.updates_per_step, lambda value: value > 0, "above 0")
-        for name in ("hidden_sizes", "model_hidden_sizes"):
-            sizes = getattr(self, name)
-            _require(
-                name,
-                sizes,
-                lambda value: len(value) > 0 and all(size >= 1 for size in value),
-                "one or more sizes from 1 on",
-            )
+        """Raises ValueError, in one line, for the first field whose value makes no sense. Traced values are not looked at.
+
+        A batch of several trainings, as `grid` makes one, is refused: each training is checked by itself.
+        """
+        for field in dataclasses.fields(self):
+            check_value(field, getattr(self, field.name))
+            if field.metadata.get("pytree_node", True):
+                _check_single(field, getattr(self, field.name))
+        _check_task(self)
         if self.segment_length > self.rollout_length:
             raise ValueError(
                 f"segment_length {self.segment_length} is longer than what a round collects: "
@@ -192,36 +230,73 @@ class Config:
             raise ValueError(
                 f"min_segment_length {self.min_segment_length} exceeds segment_length {self.segment_length}"
             )
-        if self.candidates_per_query < 10:
-            raise ValueError(
-                f"candidates_per_query {self.candidates_per_query}: choose 10 or more, or the choice is no choice"
-            )
-        for name in (
-            "lam", "temperature", "saturation_penalty", "initial_temperature", "rationality", "indifference",
-            "surrogate_decay", "surrogate_weight", "environment_entropy_weight", "policy_entropy_weight",
-        ):  # fmt: skip
-            _require(name, getattr(self, name), lambda value: value >= 0, "0 or more")
-        for name in ("gamma", "myopia", "mistake_rate", "target_rate", "anneal_share", "exploration"):
-            _require(name, getattr(self, name), lambda value: (value >= 0) & (value <= 1), "from 0 to 1")
-        for name in ("learning_rate", "dynamics_learning_rate", "surrogate_learning_rate", "reward_scale"):
-            _require(name, getattr(self, name), lambda value: value > 0, "above 0")
-        _require("seed", self.seed, lambda value: value >= 0, "a whole number from 0 on")
 
 
-def _check_choice(field: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise ValueError(unknown_name(field, value, known))
+# --- checks -----------------------------------------------------------------------------------------------------------------
 
 
-def _require(field: str, value: Any, holds: Any, right: str) -> None:
-    if isinstance(value, jax.core.Tracer):
+def check_value(field: dataclasses.Field, value: Any) -> None:
+    """Raises ValueError if a concrete value of `field`, or any of a batch of them, isn't right."""
+    right, default = field.metadata.get("right"), field.default
+    if right is None or isinstance(value, jax.core.Tracer):
         return
     try:
-        good = bool(np.all(holds(np.asarray(value) if not isinstance(value, (int, tuple)) else value)))
-    except TypeError:
+        good = _is_kind(value, default) and bool(np.all(right.holds(_comparable(value, default))))
+    except (TypeError, ValueError, OverflowError):
         good = False
-    if not good:
-        raise ValueError(f"{field} {value!r} is out of range: choose {right}")
+    if good:
+        return
+    if field.metadata["choices"] is not None:
+        raise ValueError(unknown_name(field.name, value, field.metadata["choices"]))
+    raise ValueError(f"{field.name} {shown(value)} is out of range: choose {right.words}")
+
+
+def _is_kind(value: Any, default: Any) -> bool:
+    """Whether `value` is of the kind of `default`: True is no number, 2.5 no whole number."""
+    if isinstance(default, bool | str):
+        return isinstance(value, type(default))
+    if isinstance(default, tuple):
+        return isinstance(value, tuple | list) and len(value) > 0 and all(_is_kind(one, default[0]) for one in value)
+    kind = numbers.Integral if isinstance(default, int) else numbers.Real
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return np.issubdtype(value.dtype, np.integer if kind is numbers.Integral else np.number)
+    return isinstance(value, kind) and not isinstance(value, bool)
+
+
+def _comparable(value: Any, default: Any) -> Any:
+    return value if isinstance(default, bool | str) or isinstance(value, int) else np.asarray(value)
+
+
+def _check_single(field: dataclasses.Field, value: Any) -> None:
+    """Raises ValueError for a batch where one training's value belongs."""
+    if field.name not in ("params", "belief") and np.shape(value):
+        raise ValueError(
+            f"{field.name} has shape {np.shape(value)}: a training takes one value; use jax.vmap(train) for a batch of them"
+        )
+
+
+def _check_task(config: Config) -> None:
+    """Raises ValueError if truth and belief aren't two values of the same parameters."""
+    _, params, belief = config.task()
+    true, believed = (jax.tree.structure(tree) for tree in (params, belief))
+    if true != believed:
+        raise ValueError(f"belief {_kind(belief)} doesn't fit params {_kind(params)}: give both the same fields")
+    for (path, one), other in zip(jax.tree_util.tree_leaves_with_path(params), jax.tree.leaves(belief), strict=True):
+        if np.shape(one) != np.shape(other):
+            raise ValueError(
+                f"belief has {jax.tree_util.keystr(path)} of shape {np.shape(other)} and params of {np.shape(one)}: "
+                "give both the same shapes, and one training one value"
+            )
+
+
+def _kind(tree: Any) -> str:
+    return f"of type {type(tree).__name__}"
+
+
+def shown(value: Any) -> str:
+    """A value as a message shows it, in one line that is not too long."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def grid(config: Config, **leaves: Any) -> Config:
@@ -230,21 +305,33 @@ def grid(config: Config, **leaves: Any) -> Config:
     `leaves` are sequences of one length, for traced fields: `grid(config, seed=[0, 1], lam=[2.0, 2.4])` has two cells.
 
     Raises:
-      ValueError: a static or unknown field, or sequences of different lengths.
+      ValueError: a static or unknown field, values that make no sense, or sequences of different lengths.
     """
     fields = {field.name: field for field in dataclasses.fields(config)}
-    for name in leaves:
+    for name, values in leaves.items():
         if name not in fields:
             raise ValueError(unknown_name("field", name, fields))
         if not fields[name].metadata.get("pytree_node", True):
             raise ValueError(
                 f"{name} is static: it changes the program, so its values can't share one; train each by itself"
             )
+        if name not in ("params", "belief"):
+            _check_sequence(fields[name], values)
+    config.check()
     batched = {name: jax.tree.map(jnp.asarray, value) if name in ("params", "belief") else jnp.asarray(value)
                for name, value in leaves.items()}  # fmt: skip
-    sizes = {leaf.shape[0] for value in batched.values() for leaf in jax.tree.leaves(value)}
-    if len(sizes) != 1:
-        raise ValueError(f"{', '.join(leaves)} have lengths {sorted(sizes)}: give all of them one length")
+    sizes = {leaf.shape[0] if leaf.ndim else 0 for value in batched.values() for leaf in jax.tree.leaves(value)}
+    if len(sizes) != 1 or 0 in sizes:
+        raise ValueError(
+            f"{', '.join(leaves) or 'leaves'} have lengths {sorted(sizes)}: give all of them one length from 1 on"
+        )
     (size,) = sizes
     repeated = jax.tree.map(lambda leaf: jnp.broadcast_to(jnp.asarray(leaf), (size, *jnp.shape(leaf))), config)
     return repeated.replace(**batched)
+
+
+def _check_sequence(field: dataclasses.Field, values: Any) -> None:
+    if np.ndim(values) != 1 and not isinstance(values, jax.core.Tracer):
+        raise ValueError(f"{field.name} {shown(values)} is no sequence of values: give one for each cell")
+    for value in values if isinstance(values, list | tuple) else [values]:
+        check_value(field, value)

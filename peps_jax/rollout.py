@@ -51,7 +51,7 @@ def collect(
     Returns:
       actors: where the environments stand now.
       trajectory: all transitions, each with its own last observation, never the next episode's first.
-      info: means over the episodes that ended in this round (nan if none did), and their number.
+      info: means over the episodes that ended in this round, and their number, `episodes`; where that is 0 they are 0.
     """
     environment, params, belief = methods.task(config)
     reset = jax.vmap(environment.reset, in_axes=(0, None))
@@ -90,7 +90,7 @@ def collect(
 
 def _episode_means(totals: Running, over: Array, events: Array, names: tuple[str, ...]) -> dict[str, Array]:
     number = jnp.sum(over)
-    mean = lambda values: jnp.sum(jnp.where(over, values, 0.0)) / number  # 0 / 0 = nan where no episode ended
+    mean = lambda values: jnp.sum(jnp.where(over, values, 0.0)) / jnp.maximum(number, 1)
     info = {
         "return_": mean(totals.score.return_),
         "explicability": mean(totals.score.explicability),

@@ -13,17 +13,17 @@ from peps_jax.train import check
 WRONG = [
     ("query_strategy", "information", "information_gain"),
     ("level", "maximum", "max"),
-    ("num_envs", 0, "a whole number from 1 on"),
-    ("num_envs", 2.5, "a whole number from 1 on"),
-    ("total_steps", -1, "a whole number from 1 on"),
-    ("batch_size", 0, "a whole number from 1 on"),
-    ("ensemble_size", 0, "a whole number from 1 on"),
-    ("num_queries", 0, "a whole number from 1 on"),
-    ("warmup_steps", -5, "0 or more"),
+    ("num_envs", 0, "a whole number from 1 to"),
+    ("num_envs", 2.5, "a whole number from 1 to"),
+    ("total_steps", -1, "a whole number from 1 to"),
+    ("batch_size", 0, "a whole number from 1 to"),
+    ("ensemble_size", 0, "a whole number from 1 to"),
+    ("num_queries", 0, "a whole number from 1 to"),
+    ("warmup_steps", -5, "a whole number from 0 to"),
     ("updates_per_step", 0.0, "above 0"),
-    ("hidden_sizes", (), "sizes from 1 on"),
-    ("hidden_sizes", (8, 0), "sizes from 1 on"),
-    ("model_hidden_sizes", (-1,), "sizes from 1 on"),
+    ("hidden_sizes", (), "whole numbers from 1 to"),
+    ("hidden_sizes", (8, 0), "whole numbers from 1 to"),
+    ("model_hidden_sizes", (-1,), "whole numbers from 1 to"),
     ("segment_length", 11, "10"),
     ("min_segment_length", 6, "5"),
     ("candidates_per_query", 9, "10 or more"),
@@ -38,7 +38,27 @@ WRONG = [
     ("myopia", 2.0, "from 0 to 1"),
     ("learning_rate", 0.0, "above 0"),
     ("reward_scale", -0.1, "above 0"),
-    ("seed", -1, "from 0 on"),
+    ("seed", -1, "from 0 to"),
+    ("seed", 2**31, "from 0 to"),
+    ("seed", 1.5, "from 0 to"),
+    ("seed", True, "from 0 to"),
+    ("lam", float("inf"), "0 or more"),
+    ("temperature", float("inf"), "0 or more"),
+    ("saturation_penalty", float("inf"), "0 or more"),
+    ("rationality", float("inf"), "0 or more"),
+    ("learning_rate", float("inf"), "above 0"),
+    ("reward_scale", float("inf"), "above 0"),
+    ("updates_per_step", float("inf"), "above 0"),
+    ("fade_share", float("inf"), "from 0 to 1"),
+    ("skip_below", float("nan"), "a number"),
+    ("skip_below", float("inf"), "a number"),
+    ("num_envs", 2**31, "a whole number from 1 to"),
+    ("num_envs", 2.5, "a whole number from 1 to"),
+    ("num_envs", True, "a whole number from 1 to"),
+    ("tune_temperature", 1, "True or False"),
+    ("hidden_sizes", 8, "sizes"),
+    ("lam", np.array([0.5, 1.0]), "jax.vmap"),
+    ("seed", np.arange(3), "jax.vmap"),
 ]
 
 
@@ -53,7 +73,7 @@ def test_bad_values_get_one_line(tiny, field, value, right):
         peps_jax.train(tiny.replace(**{field: value}))
     line = one_line(error)
     assert line.startswith(field)
-    assert (str(value) if not isinstance(value, np.ndarray) else "-1.") in line
+    assert isinstance(value, np.ndarray) or str(value) in line
     assert right in line
 
 
@@ -120,6 +140,10 @@ def test_grid_gives_every_leaf_an_axis(line):
         (dict(sed=[0]), "field 'sed' is unknown: did you mean 'seed'"),
         (dict(num_envs=[1, 2]), "num_envs is static"),
         (dict(seed=[0, 1], lam=[1.0]), r"seed, lam have lengths \[1, 2\]"),
+        (dict(lam=[1.0, float("inf")]), "lam inf is out of range: choose 0 or more"),
+        (dict(seed=[0, 2**31]), "seed 2147483648 is out of range"),
+        (dict(lam=2.0), "lam 2.0 is no sequence"),
+        (dict(), "leaves have lengths"),
     ],
 )
 def test_grid_says_what_is_wrong(line, leaves, message):

@@ -24,7 +24,7 @@ LAYERS = (
     ("peps_envs.bridges",),
     ("peps_jax.storage", "peps_jax.command_line", "peps_jax.trajectory"),
     ("peps_jax.config",),
-    ("peps_jax.learning.networks", "peps_jax.learning.replay"),
+    ("peps_jax.learning.networks", "peps_jax.learning.replay", "peps_jax.learning.policy_heads"),
     ("peps_jax.learning", "peps_jax.preferences"),
     ("peps_jax.methods.method",),
     ("peps_jax.methods.preference_based", "peps_jax.methods.sac"),

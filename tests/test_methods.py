@@ -11,7 +11,8 @@ from conftest import LineParams, Probe, ProbeParams
 import peps_jax
 from peps_envs import Discrete
 from peps_jax import Config, methods
-from peps_jax.learning import sac
+from peps_jax.learning import policy_heads, sac
+from peps_jax.learning.policy_heads import Gaussian
 from peps_jax.methods import drlhp
 from peps_jax.train import collect_and_ask, init
 from peps_jax.trajectory import Transition
@@ -50,56 +51,45 @@ def test_absolute_entropies_are_more_by_those_of_what_relative_ones_are_measured
 
 def test_opposed_discrete_policies_make_one_that_is_sure_of_nothing():
     """(0.1, 0.9) x (0.9, 0.1) -> (0.5, 0.5)  (the paper, Sec. 5.1)."""
-    head = sac.discrete_head(1, 2)
+    head = policy_heads.discrete_head(1, 2)
     product = lambda *policies: jax.nn.softmax(head.product(jnp.log(jnp.array(policies)) + 3.0))  # logits have no level
     np.testing.assert_allclose(product((0.1, 0.9), (0.9, 0.1)), [0.5, 0.5], rtol=1e-6)
     np.testing.assert_allclose(product((0.1, 0.9), (0.5, 0.5)), [0.1, 0.9], rtol=1e-6)
     np.testing.assert_allclose(product((0.2, 0.8), (0.4, 0.6)), [0.08 / 0.56, 0.48 / 0.56], rtol=1e-5)
 
 
-def raw(sd):
-    """The policy network's output that stands for a standard deviation."""
-    share = (np.log(sd) - sac.MIN_LOG_SD) / (sac.MAX_LOG_SD - sac.MIN_LOG_SD)
-    return np.arctanh(2 * share - 1)
-
-
-def gaussian(outputs):
-    """Mean and standard deviation before tanh."""
-    density = sac.squashed_gaussian(jnp.asarray(outputs, jnp.float32)).distribution
-    return np.asarray(density.loc), np.asarray(density.scale_diag)
+def policies(means, sds) -> Gaussian:
+    return Gaussian(jnp.array(means, jnp.float32), jnp.log(jnp.array(sds, jnp.float32)))
 
 
 def test_continuous_policies_are_weighed_by_their_precision():
-    head = sac.continuous_head(1, 2)
-    outputs = jnp.array([[1.0, -2.0, raw(0.5), raw(0.3)], [-1.0, 1.0, raw(1.0), raw(0.3)]], jnp.float32)
-    mean, sd = gaussian(head.product(outputs))
+    head = policy_heads.continuous_head(1, 2)
+    mean, log_sd = head.product(policies([[1.0, -2.0], [-1.0, 1.0]], [[0.5, 0.3], [1.0, 0.3]]))
     precision = np.array([[4.0, 1 / 0.09], [1.0, 1 / 0.09]])
-    np.testing.assert_allclose(sd, precision.sum(0) ** -0.5, rtol=1e-4)
-    np.testing.assert_allclose(mean, [(4.0 - 1.0) / 5.0, -0.5], rtol=1e-4)
+    np.testing.assert_allclose(np.exp(log_sd), precision.sum(0) ** -0.5, rtol=1e-5)
+    np.testing.assert_allclose(mean, [(4.0 - 1.0) / 5.0, -0.5], rtol=1e-5)
 
 
 def test_the_product_is_that_of_the_densities_before_tanh():
-    head = sac.continuous_head(1, 1)
-    outputs = jnp.array([[0.7, raw(0.6)], [-0.4, raw(0.9)]], jnp.float32)
+    head = policy_heads.continuous_head(1, 1)
     places = np.linspace(-6, 6, 4001)
     density = lambda mean, sd: np.exp(-0.5 * ((places - mean) / sd) ** 2) / sd
     product = density(0.7, 0.6) * density(-0.4, 0.9)
     product /= np.trapezoid(product, places)
-    mean, sd = gaussian(head.product(outputs))
-    expected = density(mean[0], sd[0]) / np.sqrt(2 * np.pi)
+    mean, log_sd = head.product(policies([[0.7], [-0.4]], [[0.6], [0.9]]))
+    expected = density(mean[0], np.exp(log_sd[0])) / np.sqrt(2 * np.pi)
     np.testing.assert_allclose(expected, product, atol=1e-4)
 
 
-def test_products_at_the_bounds_are_finite():
-    head = sac.continuous_head(1, 1)
-    for extreme in (-50.0, 50.0):
-        outputs = jnp.array([[3.0, extreme], [-3.0, extreme]])
-        product, gradient = head.product(outputs), jax.jacobian(head.product)(outputs)
-        assert bool(jnp.all(jnp.isfinite(product)))
-        assert bool(jnp.all(jnp.isfinite(gradient)))
-        np.testing.assert_allclose(product[0], 0.0, atol=1e-6)
-        _, sd = gaussian(product)
-        assert np.exp(sac.MIN_LOG_SD) * 0.99 <= sd[0] <= np.exp(sac.MAX_LOG_SD)
+@pytest.mark.parametrize("sds", [(1e-3, 1e-3), (1e3, 1e3), (1e-3, 1e3)])
+def test_products_of_extreme_policies_are_exact(sds):
+    head = policy_heads.continuous_head(1, 1)
+    stacked = policies([[20.0], [-20.0]], [[sds[0]], [sds[1]]])
+    mean, log_sd = head.product(stacked)
+    precision = np.array(sds) ** -2.0
+    np.testing.assert_allclose(log_sd, [-0.5 * np.log(precision.sum())], rtol=1e-5)
+    np.testing.assert_allclose(mean, [20.0 * (precision[0] - precision[1]) / precision.sum()], rtol=1e-5, atol=1e-4)
+    chex.assert_tree_all_finite(jax.jacobian(lambda stacked: head.product(stacked))(stacked))
 
 
 @pytest.mark.parametrize("space", ["continuous", "discrete"])
@@ -109,13 +99,14 @@ def test_one_agent_acts_by_itself_and_two_by_their_product(line, space):
     parts, network, _ = sac.networks(line)
     agents = tuple(sac.init(jax.random.key(seed), line) for seed in range(2))
     observations = jnp.linspace(-1.0, 1.0, 5)[:, None]
-    each = jnp.stack([network.apply(agent.policy, observations) for agent in agents])
-    np.testing.assert_array_equal(sac.acting_outputs(agents[:1], observations, line), each[0])
-    together = sac.acting_outputs(agents, observations, line)
-    np.testing.assert_allclose(together, jax.vmap(parts.product, in_axes=1)(each), rtol=1e-5, atol=1e-6)
+    each = [parts.policy(network.apply(agent.policy, observations)) for agent in agents]
+    chex.assert_trees_all_equal(sac.acting_policy(agents[:1], observations, line), each[0])
+    together = sac.acting_policy(agents, observations, line)
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+    chex.assert_trees_all_close(together, jax.vmap(parts.product, in_axes=1)(stacked), rtol=1e-5, atol=1e-6)
     action, ratio = sac.mode(agents, observations, line)
-    np.testing.assert_array_equal(action, parts.mode(together))
-    np.testing.assert_allclose(ratio, parts.log_ratio(together, action), rtol=1e-6)
+    np.testing.assert_array_equal(action, parts.mode(together)[0])
+    np.testing.assert_allclose(ratio, parts.log_ratio(together, action), rtol=1e-4, atol=1e-5)
     sampled, ratio = sac.act(agents, observations, jax.random.key(0), line)
     np.testing.assert_allclose(ratio, parts.log_ratio(together, sampled), rtol=1e-2, atol=1e-3)
 
@@ -167,8 +158,9 @@ def test_policy_shaping_acts_by_the_product(line, train):
     result = train(line.replace(method="policy_shaping"))
     head, network, _ = sac.networks(result.config)
     observation = jnp.array([0.3])
-    outputs = jnp.stack([network.apply(agent.policy, observation) for agent in result.agents])
-    np.testing.assert_allclose(result.act(observation), head.mode(head.product(outputs)), rtol=1e-6)
+    each = [head.policy(network.apply(agent.policy, observation)) for agent in result.agents]
+    product = head.product(jax.tree.map(lambda *leaves: jnp.stack(leaves), *each))
+    np.testing.assert_allclose(result.act(observation), head.mode(product)[0], rtol=1e-6)
 
 
 def test_the_product_and_each_policy_act_in_environments_of_their_own(line):

@@ -64,6 +64,26 @@ def test_the_most_informative_comes_first(line):
     assert chosen[1] == 3
 
 
+def test_no_candidate_is_taken_twice_while_others_are_left(line):
+    """Two kinds of candidates, 640 in all: duplicates come last, but each is a pair of its own."""
+    config = line.replace(num_queries=64 * line.num_rounds)
+    kinds = jnp.arange(640) % 2
+    logits = jnp.stack([3.0 * kinds, -3.0 * kinds])
+    chosen = np.asarray(queries.choose(logits, kinds[:, None].astype(jnp.float32), jax.random.key(0), config))
+    assert len(set(chosen.tolist())) == 64
+    assert chosen[0] % 2 == 1, "the informative kind comes first"
+    assert chosen[1] % 2 == 0, "its duplicates come after what is new"
+
+
+@pytest.mark.parametrize("strategy", ["information_gain", "disagreement"])
+def test_ties_are_broken_at_random(line, strategy):
+    config = line.replace(query_strategy=strategy)
+    first = lambda seed: int(
+        queries.choose(jnp.zeros((3, 50)), jnp.arange(50.0)[:, None], jax.random.key(seed), config)[0]
+    )
+    assert len({first(seed) for seed in range(8)}) > 3
+
+
 def collected(steps=10, num_envs=3, ends=()):
     """A trajectory whose observations say where they come from: 100 environment + step."""
     place = 100.0 * jnp.arange(num_envs)[None] + jnp.arange(steps)[:, None]

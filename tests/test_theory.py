@@ -15,7 +15,7 @@ import peps_envs
 from peps_envs import Discrete, Environment, PerceivedDensity, Step
 from peps_jax import Config, rollout
 from peps_jax.evaluate import evaluate_policy
-from peps_jax.learning import sac, surrogate
+from peps_jax.learning import policy_heads, surrogate
 from peps_jax.preferences import queries, synthetic_human
 
 # --- Eq. (4) --------------------------------------------------------------------------------------------------------------
@@ -111,7 +111,7 @@ def test_the_metric_is_the_divergence_of_eq_3():
     log_normaliser = np.log(np.exp(log_human).sum())
     divergence = np.sum(np.exp(log_agent) * (log_agent - (log_human - log_normaliser)))
 
-    head = sac.discrete_head(1, ACTIONS)
+    head = policy_heads.discrete_head(1, ACTIONS)
     table = jnp.asarray(logits, jnp.float32)
     act = lambda observation, key: head.sample(table[observation[0].astype(jnp.int32)], head.noise(key, ()))
     roll = lambda key: evaluate_policy(act, Chain(), params, belief, key, 40_000, stochastic=True)

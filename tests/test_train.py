@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import LineParams
+from conftest import Line, LineParams
 
 import peps_jax
 from peps_jax import grid
@@ -149,6 +149,16 @@ def test_a_round_at_a_time_gives_the_scans_numbers(line, first_state, rounds, st
     for index in range(line.num_rounds):
         state, _ = step(state, jnp.asarray(index), line)
     assert_close(state, whole, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("method", ["peps", "policy_shaping"])
+def test_nothing_makes_nan_in_a_round_in_which_no_episode_ends(line, method):
+    config = line.replace(env=Line(horizon=1000), method=method, warmup_steps=0, exploration=0.0, total_steps=80)
+    with jax.debug_nans(True):
+        curves = jax.jit(peps_jax.train)(config).curves
+    assert not np.all(curves["episodes"] > 0)
+    assert all(np.all(np.isfinite(curve)) for curve in curves.values())
+    assert np.all(np.asarray(curves["return_"])[np.asarray(curves["episodes"]) == 0] == 0)
 
 
 def test_a_saved_state_continues_as_if_nothing_had_been(line, first_state, step, tmp_path):

@@ -97,8 +97,9 @@ class Display(batches.Watch):
         self, batch: batches.Batch, rounds: int, curves: dict[str, np.ndarray], snapshot: Callable[[], batches.Progress]
     ) -> None:
         self._done += self._steps_per_round(batch) * next(iter(curves.values())).shape[1]
+        ended = curves["episodes"] > 0
         for name in self._latest:
-            seen = curves[name][np.isfinite(curves[name])]
+            seen = curves[name][ended]
             self._latest[name] = seen.mean() if seen.size else self._latest[name]
         now = time.perf_counter()
         speed = (self._done - self._before) / (now - self._started)

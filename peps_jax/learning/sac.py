@@ -4,16 +4,14 @@
     J(pi) = E[alpha l_pi(a|s) - min_j Q_j(s,a)]
 
 l_pi = log pi - log uniform: relative to the uniform policy, so that the entropy is at most 0 and never pays for staying alive.
-What the policy's head is made of (a squashed Gaussian, or probabilities of discrete actions) is a `Head`.
+How actions are drawn and valued (a squashed Gaussian, or probabilities of discrete actions) is a `Head`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import distrax
 import jax
 import jax.numpy as jnp
 import optax
@@ -22,10 +20,10 @@ from jax import Array
 
 import peps_envs
 from peps_jax.config import Config
-from peps_jax.learning.networks import MLP, apply_ensemble, init_ensemble
+from peps_jax.learning.networks import MLP, init_ensemble
+from peps_jax.learning.policy_heads import Head, continuous_head, discrete_head
 from peps_jax.trajectory import Transition
 
-MIN_LOG_SD, MAX_LOG_SD = -5.0, 2.0
 NUM_CRITICS = 2
 
 
@@ -40,127 +38,6 @@ class Agent:
     policy_optimizer: Any
     critic_optimizer: Any
     temperature_optimizer: Any
-
-
-class Head(NamedTuple):
-    """How actions are drawn and valued. `outputs` are the policy network's, `critics` a function of (observation, action).
-
-    Whatever is random comes as `noise`, so that all of a round's is drawn at once: a draw in each update takes a tenth of its time.
-    """
-
-    policy_size: int
-    critic_inputs: int
-    critic_size: int
-    noise: Callable[[Array, tuple[int, ...]], Array]  # (key, shape) -> of so many actions, (*shape, ...)
-    sample: Callable[[Array, Array], tuple[Array, Array]]  # (outputs, noise) -> action, l_pi
-    mode: Callable[[Array], Array]  # outputs -> action
-    log_ratio: Callable[[Array, Array], Array]  # (outputs, action) -> l_pi
-    product: Callable[[Array], Array]  # outputs of several policies, stacked -> those of their normalised product
-    uniform: Callable[[Array], Array]  # key -> action
-    critics: Callable[[Any, Any, Array, Array], Array]  # (network, params, observation, action) -> (critics, ...)
-    penalty: Callable[[Array], Array]  # outputs -> what keeps the policy where gradients reach it, at least 0
-    # (outputs, noise, network, params, observation) -> E_pi[min Q], E_pi[l_pi]
-    expect: Callable[[Array, Array, Any, Any, Array], tuple[Array, Array]]
-
-
-def _gaussian(outputs: Array) -> tuple[Array, Array]:
-    """Mean and log standard deviation before tanh, from outputs (..., 2n)."""
-    mean, log_sd = jnp.split(outputs, 2, axis=-1)
-    return mean, MIN_LOG_SD + 0.5 * (MAX_LOG_SD - MIN_LOG_SD) * (jnp.tanh(log_sd) + 1)
-
-
-def squashed_gaussian(outputs: Array) -> distrax.Distribution:
-    """tanh of a Gaussian: actions in (-1, 1)^n from outputs (..., 2n)."""
-    mean, log_sd = _gaussian(outputs)
-    return distrax.Transformed(distrax.MultivariateNormalDiag(mean, jnp.exp(log_sd)), distrax.Block(distrax.Tanh(), 1))
-
-
-def continuous_head(observation_size: int, action_size: int) -> Head:
-    """A tanh-squashed Gaussian; expectations are taken with one sample, through which gradients flow."""
-    log_volume = action_size * math.log(2.0)  # of [-1, 1]^n
-
-    def sample(outputs: Array, noise: Array) -> tuple[Array, Array]:
-        density = squashed_gaussian(outputs)
-        mean, log_sd = _gaussian(outputs)
-        before = mean + jnp.exp(log_sd) * noise
-        action, log_slope = density.bijector.forward_and_log_det(before)
-        return action, density.distribution.log_prob(before) - log_slope + log_volume
-
-    def log_ratio(outputs: Array, action: Array) -> Array:
-        # the inverse of tanh is infinite at 1
-        limit = 1 - 1e-6
-        return squashed_gaussian(outputs).log_prob(jnp.clip(action, -limit, limit)) + log_volume
-
-    def critics(network: MLP, params: Any, observation: Array, action: Array) -> Array:
-        return apply_ensemble(network)(params, jnp.concatenate([observation, action], -1))[..., 0]
-
-    def expect(outputs: Array, noise: Array, network: MLP, params: Any, observation: Array) -> tuple[Array, Array]:
-        action, ratio = sample(outputs, noise)
-        return jnp.min(critics(network, params, observation, action), 0), ratio
-
-    def product(outputs: Array) -> Array:
-        # of the Gaussians before tanh: the product of squashed densities would count tanh's Jacobian once for each
-        mean, log_sd = _gaussian(outputs)
-        precision = jnp.exp(-2 * log_sd)
-        total = jnp.sum(precision, 0)
-        share = (-0.5 * jnp.log(total) - MIN_LOG_SD) / (MAX_LOG_SD - MIN_LOG_SD)  # of the way between a head's bounds
-        limit = 1 - 1e-6  # the inverse of tanh is infinite at 1
-        return jnp.concatenate(
-            [jnp.sum(precision * mean, 0) / total, jnp.arctanh(jnp.clip(2 * share - 1, -limit, limit))], -1
-        )
-
-    return Head(
-        policy_size=2 * action_size,
-        critic_inputs=observation_size + action_size,
-        critic_size=1,
-        noise=lambda key, shape: jax.random.normal(key, (*shape, action_size)),
-        sample=sample,
-        mode=lambda outputs: jnp.tanh(jnp.split(outputs, 2, axis=-1)[0]),
-        log_ratio=log_ratio,
-        product=product,
-        uniform=lambda key: jax.random.uniform(key, (action_size,), minval=-1.0, maxval=1.0),
-        critics=critics,
-        # where tanh is flat no gradient turns an action back: a policy that leans against a wall would stay there
-        penalty=lambda outputs: jnp.mean(jnp.sum(jnp.split(outputs, 2, axis=-1)[0] ** 2, -1)),
-        expect=expect,
-    )
-
-
-def discrete_head(observation_size: int, num_actions: int) -> Head:
-    """Probabilities of discrete actions; critics value all of them at once, so expectations are exact sums."""
-    log_actions = math.log(num_actions)
-
-    def log_ratio(outputs: Array, action: Array) -> Array:
-        return jnp.take_along_axis(jax.nn.log_softmax(outputs), action[..., None], -1)[..., 0] + log_actions
-
-    def sample(outputs: Array, noise: Array) -> tuple[Array, Array]:
-        action = jnp.argmax(outputs + noise, -1)  # the Gumbel-max trick
-        return action, log_ratio(outputs, action)
-
-    def critics(network: MLP, params: Any, observation: Array, action: Array) -> Array:
-        values = apply_ensemble(network)(params, observation)
-        return jnp.take_along_axis(values, jnp.broadcast_to(action, values.shape[:-1])[..., None], -1)[..., 0]
-
-    def expect(outputs: Array, noise: Array, network: MLP, params: Any, observation: Array) -> tuple[Array, Array]:
-        del noise
-        probabilities, log_probabilities = jax.nn.softmax(outputs), jax.nn.log_softmax(outputs)
-        values = jnp.min(apply_ensemble(network)(params, observation), 0)
-        return jnp.sum(probabilities * values, -1), jnp.sum(probabilities * log_probabilities, -1) + log_actions
-
-    return Head(
-        policy_size=num_actions,
-        critic_inputs=observation_size,
-        critic_size=num_actions,
-        noise=lambda key, shape: jax.random.gumbel(key, (*shape, num_actions)),
-        sample=sample,
-        mode=lambda outputs: jnp.argmax(outputs, -1),
-        log_ratio=log_ratio,
-        product=lambda outputs: jnp.sum(jax.nn.log_softmax(outputs), 0),
-        uniform=lambda key: jax.random.randint(key, (), 0, num_actions),
-        critics=critics,
-        penalty=lambda outputs: jnp.zeros(()),
-        expect=expect,
-    )
 
 
 def head(environment: peps_envs.Environment) -> Head:
@@ -213,25 +90,23 @@ def draw_noise(key: Array, shape: tuple[int, ...], config: Config) -> Noise:
     return Noise(*(parts.noise(key, shape) for key in jax.random.split(key)))
 
 
-def acting_outputs(agents: tuple[Agent, ...], observation: Array, config: Config) -> Array:
-    """Outputs of the acting policy: the only agent's own, or those of the normalised product of several agents' policies."""
+def acting_policy(agents: tuple[Agent, ...], observation: Array, config: Config) -> Any:
+    """The policy that acts: the only agent's own, or the normalised product of several agents' policies."""
     parts, policy_network, _ = networks(config)
-    outputs = [policy_network.apply(agent.policy, observation) for agent in agents]
-    return outputs[0] if len(agents) == 1 else parts.product(jnp.stack(outputs))
+    policies = [parts.policy(policy_network.apply(agent.policy, observation)) for agent in agents]
+    return policies[0] if len(agents) == 1 else parts.product(jax.tree.map(lambda *each: jnp.stack(each), *policies))
 
 
 def act(agents: tuple[Agent, ...], observation: Array, key: Array, config: Config) -> tuple[Array, Array]:
     """An action sampled from the acting policy, and l_pi(a|s)."""
     parts, _, _ = networks(config)
-    return parts.sample(acting_outputs(agents, observation, config), parts.noise(key, observation.shape[:-1]))
+    return parts.sample(acting_policy(agents, observation, config), parts.noise(key, observation.shape[:-1]))
 
 
 def mode(agents: tuple[Agent, ...], observation: Array, config: Config) -> tuple[Array, Array]:
     """The acting policy's most likely action before squashing, and l_pi(a|s)."""
     parts, _, _ = networks(config)
-    outputs = acting_outputs(agents, observation, config)
-    action = parts.mode(outputs)
-    return action, parts.log_ratio(outputs, action)
+    return parts.mode(acting_policy(agents, observation, config))
 
 
 def critic_loss(critics: Any, targets: Array, batch: Transition, config: Config) -> Array:
@@ -244,8 +119,8 @@ def critic_loss(critics: Any, targets: Array, batch: Transition, config: Config)
 def critic_targets(agent: Agent, batch: Transition, temperature: Array, noise: Array, config: Config) -> Array:
     """r + gamma (1 - terminated) V(s') by the target critics: bootstraps through a time limit, not through an end."""
     parts, policy_network, critic_network = networks(config)
-    outputs = policy_network.apply(agent.policy, batch.next_observation)
-    value, ratio = parts.expect(outputs, noise, critic_network, agent.targets, batch.next_observation)
+    policy = parts.policy(policy_network.apply(agent.policy, batch.next_observation))
+    value, ratio = parts.expect(policy, noise, critic_network, agent.targets, batch.next_observation)
     return batch.reward + config.gamma * (1 - batch.terminated) * (value - temperature * ratio)
 
 
@@ -254,9 +129,9 @@ def policy_loss(
 ) -> tuple[Array, Array]:
     """E[alpha l_pi - min Q], and the mean policy entropy relative to the uniform policy."""
     parts, policy_network, critic_network = networks(config)
-    outputs = policy_network.apply(policy, batch.observation)
-    value, ratio = parts.expect(outputs, noise, critic_network, critics, batch.observation)
-    penalty = config.saturation_penalty * config.reward_scale * parts.penalty(outputs)
+    acting = parts.policy(policy_network.apply(policy, batch.observation))
+    value, ratio = parts.expect(acting, noise, critic_network, critics, batch.observation)
+    penalty = config.saturation_penalty * config.reward_scale * parts.penalty(acting)
     return jnp.mean(temperature * ratio - value) + penalty, -jnp.mean(ratio)
 
 

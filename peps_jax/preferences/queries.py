@@ -59,28 +59,32 @@ def disagreement(logits: Array) -> Array:
 
 
 def choose(logits: Array, descriptions: Array, key: Array, config: Config) -> Array:
-    """Indices (queries_per_round,) of the candidates to ask, best first, without near-duplicates.
+    """Indices (queries_per_round,) of the candidates to ask, best first: none twice, and near-duplicates last.
 
     Args:
       logits: (members, candidates) of the first segment being preferred.
       descriptions: (candidates, n) of each pair; a pair near an already chosen one counts for less,
-        1 - exp(-(distance / typical distance)^2).
+        1 - exp(-(distance / typical distance)^2). Between equals, all of no worth for example, chance decides.
     """
     score = {
         "information_gain": lambda: information_gain(logits) + 1e-9,
         "disagreement": lambda: disagreement(logits) + 1e-9,
         "random": lambda: jax.random.uniform(key, logits.shape[1:], minval=1e-3),
     }[config.query_strategy]()
+    luck = jax.random.uniform(jax.random.fold_in(key, 1), score.shape)
     # mean squared distance of two candidates
     typical = 2 * jnp.mean(jnp.var(descriptions, 0)) * descriptions.shape[1] + 1e-6
 
-    def take(score: Array, _: None) -> tuple[Array, Array]:
-        best = jnp.argmax(score)
+    def take(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
+        score, free = carry
+        offered = jnp.where(free, score, -1.0)
+        best = jnp.argmax(jnp.where(offered == jnp.max(offered), luck, -1.0))
         squared = jnp.sum((descriptions - descriptions[best][None]) ** 2, -1)
-        # a tenth of the typical distance counts as near; the chosen one itself gets 0 and is never taken twice
-        return score * -jnp.expm1(-100 * squared / typical), best
+        # a tenth of the typical distance counts as near
+        score = score * -jnp.expm1(-100 * squared / typical)
+        return (score, free & (jnp.arange(score.shape[0]) != best)), best
 
-    _, chosen = jax.lax.scan(take, score, None, config.queries_per_round)
+    _, chosen = jax.lax.scan(take, (score, jnp.ones(score.shape, bool)), None, config.queries_per_round)
     return chosen
 
 

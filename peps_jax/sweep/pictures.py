@@ -53,9 +53,9 @@ def _of_method(rows: Sequence[Row], env: str, method: str, lam: float) -> list[R
 # --- curves ---------------------------------------------------------------------------------------------------------------
 
 
-def _smooth(values: np.ndarray, width: int) -> np.ndarray:
-    """Mean over the last `width` rounds (rounds,); nan where no episode ended in any of them."""
-    seen = np.isfinite(values)
+def _smooth(values: np.ndarray, episodes: np.ndarray, width: int) -> np.ndarray:
+    """Mean over the last `width` rounds (rounds,); nan where no episode ended in any of them, as `episodes` (rounds,) tells."""
+    seen = (episodes > 0) & np.isfinite(values)
     recent = lambda numbers: np.convolve(numbers, np.ones(width))[: len(numbers)]
     count = recent(seen.astype(float))
     return np.where(count > 0.5, recent(np.where(seen, values, 0.0)) / np.maximum(count, 1), np.nan)
@@ -97,7 +97,8 @@ def _curve(axes: Axes, members: Sequence[Row], curve: str) -> np.ndarray:
     """One method's line and band; returns the line without its first fifth."""
     config = members[0].finished.result.config
     width = max(1, config.num_rounds // 15)
-    seeds = np.stack([_smooth(row.finished.result.curves[curve], width) for row in members])
+    curves = [row.finished.result.curves for row in members]
+    seeds = np.stack([_smooth(own[curve], own["episodes"], width) for own in curves])
     places = np.flatnonzero(np.isfinite(seeds).any(0))
     mean, low, high = (reduce(seeds[:, places], 0) for reduce in (np.nanmean, np.nanmin, np.nanmax))
     steps = (places + 1) * config.steps_per_round / 1000
