@@ -1,6 +1,7 @@
 """A sweep over several processes has the files of one process, and one that fails takes nothing with it."""
 
 import csv
+import itertools
 import json
 import os
 import socket
@@ -38,17 +39,21 @@ def team(line, monkeypatch):
     monkeypatch.setattr(pictures, "draw", lambda rows, folder: [])
     monkeypatch.setattr(workers, "SILENCE", 1.0)
     monkeypatch.setattr(workers, "BEAT", 0.1)
-    monkeypatch.setattr(workers, "join", lambda _, count, index: workers.Team(index, count, "this run", count))
+    run = lambda coordinator: coordinator.replace(":", "-")  # the same for all, and another one every time
+    monkeypatch.setattr(workers, "join", lambda where, count, index: workers.Team(index, count, run(where), count))
 
 
-def member(index: int, count: int) -> list[str]:
-    return ["--coordinator", "here:1", "--processes", str(count), "--process", str(index)]
+PORTS = itertools.count(1)
+
+
+def member(index: int, count: int, port: int = 0) -> list[str]:
+    return ["--coordinator", f"here:{port}", "--processes", str(count), "--process", str(index)]
 
 
 def run_together(folder: Path, indices: list[int], count: int, *flags: str) -> dict[int, int]:
     """The exit codes of those processes."""
-    codes = {}
-    act = lambda index: codes.update({index: call(*flags, *member(index, count), "--out", folder)})
+    codes, port = {}, next(PORTS)
+    act = lambda index: codes.update({index: call(*flags, *member(index, count, port), "--out", folder)})
     threads = [threading.Thread(target=act, args=(index,)) for index in indices]
     for thread in threads:
         thread.start()
