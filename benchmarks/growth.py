@@ -16,7 +16,7 @@ import timing
 from training import seeds_of, shortened, steps_of
 
 from peps_jax import Config, train
-from peps_jax.execution import batches
+from peps_jax.execution.program import stack
 
 ROUNDS = 8
 MOST = 8  # cells in a program: a sweep of many keeps what it has, batch by batch
@@ -25,7 +25,7 @@ LARGEST = 64
 
 def seconds_of(config: Config, cells: int, repeats: int = 3) -> float:
     """Of training so many seeds at the same time."""
-    batched = timing.spread(batches.stack(seeds_of(config, cells)))
+    batched = timing.spread(stack(seeds_of(config, cells)))
     program, _ = timing.compiled(train, batched)
     return timing.seconds(program, batched, repeats=repeats)
 
@@ -37,7 +37,7 @@ def seeds(config: Config, most: int, repeats: int) -> dict[str, float]:
     while size <= most:
         inside = min(size, max(MOST, devices))
         filled = -(-inside // devices) * devices  # every device gets as many
-        batched = timing.spread(batches.stack(seeds_of(config, filled)))
+        batched = timing.spread(stack(seeds_of(config, filled)))
         if filled not in programs:
             programs[filled], _ = timing.compiled(train, batched)
         calls = range(-(-size // inside))

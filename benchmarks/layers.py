@@ -35,8 +35,8 @@ WAYS: dict[str, Network] = {
 def cases() -> dict[str, Case]:
     """What a training of D1 has, as the text calls it, and the same with critics of 256 units."""
     config = Config(env="nav-d1")
-    environment, _, _ = config.task()
-    inputs = networks.feature_size(environment)
+    environment = config.problem().environment
+    inputs = networks.feature_size(environment.observation_size, environment.action_space)
     compared = config.surrogate_batch_size * 2 * config.segment_length
     return {
         "r̂": Case(config.ensemble_size, compared, (inputs, *config.model_hidden_sizes, 1)),

@@ -52,7 +52,7 @@ def to_inputs(batch: int, sizes: tuple[int, ...]) -> list[Product]:
 
 def products(config: Config) -> collections.Counter[Product]:
     """The products of one update, and how often each is made."""
-    environment, _, _ = config.task()
+    environment = config.problem().environment
     o, a, b = environment.observation_size, environment.action_space.size, config.batch_size
     policy, critic = (o, *config.hidden_sizes, 2 * a), (o + a, *config.hidden_sizes, 1)
     to_action = [*to_inputs(b, critic), Product(b, config.hidden_sizes[0], a)]

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import timing
 from training import WIDTHS, seeds_of, shortened
 
-from peps_jax import Config, methods, rollout
-from peps_jax.execution import batches
+from peps_jax import Config, rollout
+from peps_jax.execution.program import stack
 from peps_jax.learning import dynamics, replay, sac
 from peps_jax.methods import peps, preference_based
-from peps_jax.preferences import synthetic_human
-from peps_jax.train import TrainingState, collect_and_ask, improve, init, run_round, run_rounds, value
-from peps_jax.trajectory import Preferences, Trajectory, Transition
+from peps_jax.preferences import data
+from peps_jax.preferences.data import PreferenceSet
+from peps_jax.round import round_at
+from peps_jax.train import TrainingState
+from peps_jax.trajectory import Trajectory, Transition
+
+train = importlib.import_module("peps_jax.train")  # the module: the package shows the function of that name
 
 PARTS = {  # as the text calls them
     "collect": "collecting",
@@ -29,50 +34,69 @@ PARTS = {  # as the text calls them
 AT_ONCE = "value at once"  # tried: r-hat and entropies of all of a round's minibatches in one piece
 
 
-def prepare(config: Config) -> tuple[TrainingState, Trajectory, Preferences | None, Transition]:
-    """A training's state half way, and what the parts of its next round hand to one another."""
-    index, key = config.num_rounds // 2, jax.random.key(1)
-    state, _ = run_rounds(init(config), jnp.arange(index), config)
-    act = lambda observation, key, time: sac.act(state.agents, observation, key, config)[0]
-    _, trajectory, _ = rollout.collect(state.actors, act, key, config)
-    queries = methods.get(config.method).ask(state.knowledge, trajectory, key, config)
-    preferences = None if queries is None else synthetic_human.SYNTHETIC.answer(key, queries, config)
-    shape = (config.updates_per_round, config.batch_size)
-    return state, trajectory, preferences, replay.sample(state.replay, key, shape, index * config.steps_per_round)
+class Prepared(NamedTuple):
+    """A training half way, and what the parts of its next round hand to one another."""
+
+    state: TrainingState
+    trajectory: Trajectory
+    preferences: PreferenceSet | None  # that are known
+    batches: Transition
 
 
-def parts(structure: Config) -> dict[str, Callable[..., Any]]:
+def prepare(config: Config) -> Prepared:
+    """Half a training."""
+    training, index, key = train.prepare(config), config.num_rounds // 2, jax.random.key(1)
+    state, _ = train.run_rounds(train.init(training), jnp.arange(index, dtype=jnp.int32), training)
+    settings = training.settings
+    act = lambda observation, key, time: sac.act(state.agents, observation, key, settings.agent)[0]
+    _, trajectory, _ = rollout.collect(state.actors, act, key, training.problem, settings.rollout)
+    preferences = None if state.preferences is None else data.known(state.preferences, index)
+    batches = replay.sample(
+        state.replay, key, (settings.agent.updates, settings.agent.batch_size), index * config.steps_per_round
+    )
+    return Prepared(state, trajectory, preferences, batches)
+
+
+def parts(structure: Config) -> dict[str, Callable[[Prepared, Config], Any]]:
     """What a round of PEPS does, by the names of `PARTS`; of SAC, what it does of that; `AT_ONCE`; and the `whole`."""
     index, key = jnp.int32(structure.num_rounds // 2), jax.random.key(1)
-    filled = (index + 1) * structure.steps_per_round
-    plain = lambda config: config.replace(method="sac")  # asks nothing, and takes rewards as they are
+    plain = lambda config: train.prepare(config.replace(method="sac"))  # asks nothing, and takes rewards as they are
+    now = lambda given, training: round_at(index, given.state.key, training.settings.schedule)
 
-    def collect(state, trajectory, preferences, batches, config):
-        return collect_and_ask(state, index, plain(config))
+    def collect(given: Prepared, config: Config) -> Any:
+        training = plain(config)
+        return train.collect_and_ask(given.state, now(given, training), training)
 
-    def ask(state, trajectory, preferences, batches, config):
-        queries = methods.get(config.method).ask(state.knowledge, trajectory, key, config)
-        return synthetic_human.SYNTHETIC.answer(key, queries, config)
+    def ask(given: Prepared, config: Config) -> Any:
+        training = train.prepare(config)
+        segments = training.method.ask(given.state.knowledge, given.trajectory, key, training.settings)
+        _, queries = data.ask(given.state.preferences, segments, index, training.settings.queries)
+        return training.answer(key, queries, training.problem, training.settings.human)
 
-    def fit_dynamics(state, trajectory, preferences, batches, config):
-        return dynamics.fit(state.knowledge.dynamics, state.replay, filled, key, config)
+    def fit_dynamics(given: Prepared, config: Config) -> Any:
+        training, state = train.prepare(config), given.state
+        filled = now(given, training).filled
+        return dynamics.fit(state.knowledge.dynamics, state.replay, filled, key, training.settings.dynamics)
 
-    def fit_surrogate(state, trajectory, preferences, batches, config):
-        return preference_based.learn(
-            state.knowledge.surrogate, state.replay, filled, preferences, index, (key, key), config
+    def fit_surrogate(given: Prepared, config: Config) -> Any:
+        training, state = train.prepare(config), given.state
+        filled = now(given, training).filled
+        return preference_based.fit_surrogate(
+            state.knowledge.surrogate, state.replay, given.preferences, filled, key, training.settings
         )
 
-    def value_parts(state, trajectory, preferences, batches, config):
-        return value(peps.reward, state.knowledge, batches, config)
+    def value_parts(given: Prepared, config: Config) -> Any:
+        return train.value(peps.reward, given.state.knowledge, given.batches, train.prepare(config).settings)
 
-    def value_at_once(state, trajectory, preferences, batches, config):
-        return peps.reward(state.knowledge, batches, config)
+    def value_at_once(given: Prepared, config: Config) -> Any:
+        return peps.reward(given.state.knowledge, given.batches, train.prepare(config).settings)
 
-    def update(state, trajectory, preferences, batches, config):
-        return improve(state, index, key, plain(config))
+    def update(given: Prepared, config: Config) -> Any:
+        training = plain(config)
+        return train.improve(given.state, now(given, training), training)
 
-    def whole(state, trajectory, preferences, batches, config):
-        return run_round(state, index, config)
+    def whole(given: Prepared, config: Config) -> Any:
+        return train.run_round(given.state, index, train.prepare(config))
 
     learned = {
         "ask": ask,
@@ -87,12 +111,12 @@ def parts(structure: Config) -> dict[str, Callable[..., Any]]:
 def seconds_of_parts(config: Config, repeats: int) -> dict[str, float]:
     """Seconds of each part of one cell's round, while all devices do the same."""
     each = 4  # cells on a device, so that what a call costs is little of it
-    cells = timing.spread(batches.stack(seeds_of(config, each * jax.device_count())))
+    cells = timing.spread(stack(seeds_of(config, each * jax.device_count())))
     prepared = timing.compiled(prepare, cells)[0](cells)
     taken = {}
     for name, part in parts(config).items():
-        program, _ = timing.compiled(part, *prepared, cells)
-        taken[name] = timing.seconds(program, *prepared, cells, repeats=repeats) / each
+        program, _ = timing.compiled(part, prepared, cells)
+        taken[name] = timing.seconds(program, prepared, cells, repeats=repeats) / each
     return taken
 
 

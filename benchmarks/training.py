@@ -9,7 +9,7 @@ import peer
 import timing
 
 from peps_jax import Config, train
-from peps_jax.execution import batches
+from peps_jax.execution.program import stack
 
 WIDTHS = (64, 256)
 
@@ -47,7 +47,7 @@ def cost(
     configs: list[Config], devices: int | None = None, together: bool = False, repeats: int = 3
 ) -> dict[str, float]:
     """Trains all `configs`, of one structure: environment steps a second, summed over cells."""
-    cells = timing.spread(batches.stack(configs), devices)
+    cells = timing.spread(stack(configs), devices)
     program, compilation = timing.compiled(train, cells, devices=devices, together=together)
     seconds = timing.seconds(program, cells, repeats=repeats)
     return {"rate": sum(map(steps_of, configs)) / seconds, "seconds": seconds, "compilation": compilation}

@@ -26,10 +26,10 @@ from peps_jax import Config, evaluate
 from peps_jax.analysis import navigation_planner
 from peps_jax.analysis.intervals import estimate, mean
 from peps_jax.command_line import use_every_core
-from peps_jax.execution.batches import compile_over_devices
+from peps_jax.execution.devices import compile_over_devices
 from peps_jax.learning import surrogate
 from peps_jax.preferences import synthetic_human
-from peps_jax.train import finish, init, run_rounds
+from peps_jax.train import finish, init, prepare, run_rounds
 
 DOMAINS = ("nav-d1", "nav-d2", "nav-d3", "nav-d4")
 ROUTES = {  # the paper's Figure 2: PEPS's and SAC's
@@ -63,9 +63,10 @@ def route(domain: str, places: np.ndarray, arrived: bool = True) -> str:
 
 def measure(config: Config) -> dict[str, jax.Array]:
     """One cell: train, evaluate, and compare r-hat with what the human feels, over everything visited."""
-    state, curves = run_rounds(init(config), jnp.arange(config.num_rounds), config)
-    result = finish(state, curves, config)
-    mode, sampled = (evaluate(result, config, 100, stochastic=stochastic) for stochastic in (False, True))
+    training = prepare(config)
+    state, curves = run_rounds(init(training), jnp.arange(config.num_rounds), training)
+    result = finish(state, curves, training)
+    mode, sampled = (evaluate(result, 100, stochastic=stochastic) for stochastic in (False, True))
     figures = {
         "return": mode.return_.mean(),
         "explicability": mode.explicability.mean(),
@@ -75,13 +76,16 @@ def measure(config: Config) -> dict[str, jax.Array]:
         "sampled_explicability": sampled.explicability.mean(),
     }
     if config.method == "peps":
-        environment, params, belief = config.task()
+        problem = training.problem
+        environment, params, belief = problem.environment, problem.params, problem.belief
         rows = jax.tree.map(lambda values: values[:: max(1, values.shape[0] // 3000)], state.replay)
         place = lambda observation: NavigationState(environment.position_of(observation, params), jnp.int32(0))
         felt = jax.vmap(lambda row: sum(synthetic_human.log_weight(
             environment, belief, place(row.observation), row.action, place(row.next_observation))))(rows)  # fmt: skip
         figures["felt"] = felt
-        figures["predicted"] = surrogate.predict(result.knowledge.surrogate, rows.observation, rows.action, config)
+        figures["predicted"] = surrogate.predict(
+            result.surrogate, rows.observation, rows.action, training.settings.surrogate
+        )
     return figures
 
 

@@ -2,7 +2,7 @@
 
 What changes shapes or program structure is static: `jax.jit(train)` compiles once for each. Everything else is a traced leaf,
 so `jax.vmap(train)` takes a `Config` with batched leaves. A field's metadata has its help text, its group and what values are
-right; checks and command-line flags follow from it.
+right; checks and command-line flags follow from it. `peps_jax.settings` divides the fields among the parts that use them.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from peps_envs.registry import unknown_name
 
 STRATEGIES = ("information_gain", "disagreement", "random")
 LEVELS = ("none", "quantile", "max", "standard")
+ENTROPIES = ("relative", "absolute")
 MOST = 2**31 - 1  # of whole numbers: sizes and seeds are 32-bit
 
 
@@ -59,6 +60,15 @@ def _traced(default: Any, right: Right | None, text: str, **metadata: Any) -> An
 
 
 @struct.dataclass
+class Problem:
+    """The MDP that the agent acts in, and the one that the human believes it acts in: one environment, two sets of parameters."""
+
+    environment: peps_envs.Environment = struct.field(pytree_node=False)
+    params: Any  # of the domain that the agent acts in
+    belief: Any
+
+
+@struct.dataclass
 class Config:
     """One training. Rewards and temperatures are in the environment's reward units; rates are per gradient step.
 
@@ -89,6 +99,12 @@ class Config:
     )
     policy_entropy_weight: Any = _traced(
         0.3, NOT_NEGATIVE, "weight of the policy entropy in Eq. (6)", group="objective"
+    )
+    entropies: str = _static(
+        "relative",
+        ENTROPIES,
+        "what Eq. (6)'s entropies are measured against: kernel and uniform policy (relative), or nothing (absolute)",
+        group="objective",
     )
     gamma: Any = _traced(0.995, SHARE, "discount", group="objective")
 
@@ -128,6 +144,7 @@ class Config:
     )
     dynamics_learning_rate: Any = _traced(1e-3, POSITIVE, "Adam's rate for the dynamics", group="models")
     dynamics_updates: int = _static(20, COUNT, "gradient steps on the dynamics in a round", group="models")
+    dynamics_batch_size: int = _static(256, COUNT, "transitions in a minibatch of the dynamics' fit", group="models")
     surrogate_learning_rate: Any = _traced(5e-3, POSITIVE, "Adam's rate for the surrogate reward", group="models")
     surrogate_updates: int = _static(40, COUNT, "gradient steps on the surrogate reward in a round", group="models")
     surrogate_batch_size: int = _static(64, COUNT, "preferences in a minibatch of the surrogate's fit", group="models")
@@ -136,7 +153,7 @@ class Config:
         "none", LEVELS, f"what pins the surrogate reward's level after the fit: {', '.join(LEVELS)}", group="models"
     )
 
-    num_queries: int = _static(3_000, COUNT, "preferences that the teacher gives in all", group="queries")
+    num_queries: int = _static(3_000, COUNT, "queries that the teacher is asked in all", group="queries")
     segment_length: int = _static(5, COUNT, "steps of the longest segment", group="queries")
     min_segment_length: int = _static(
         2, COUNT, "steps of the shortest segment (unequal lengths pin the level)", group="queries"
@@ -170,8 +187,8 @@ class Config:
                 raise ValueError(unknown_name("belief", self.belief, beliefs))
             object.__setattr__(self, "belief", beliefs[self.belief])
 
-    def task(self) -> tuple[peps_envs.Environment, Any, Any]:
-        """The environment, its true parameters and the human's belief.
+    def problem(self) -> Problem:
+        """The environment, its true parameters and the human's belief, which `env`, `params` and `belief` name.
 
         Raises:
           ValueError: no environment of that name, or an environment object without `params` and `belief`.
@@ -180,11 +197,11 @@ class Config:
             for field in ("params", "belief"):
                 if getattr(self, field) is None:
                     raise ValueError(f"{field} is None: give it when env is an Environment object")
-            return self.env, self.params, self.belief
+            return Problem(self.env, self.params, self.belief)
         task = peps_envs.make(self.env)
         params = task.params if self.params is None else self.params
         belief = task.beliefs[task.default_belief] if self.belief is None else self.belief
-        return task.environment, params, belief
+        return Problem(task.environment, params, belief)
 
     @property
     def steps_per_round(self) -> int:
@@ -220,7 +237,7 @@ class Config:
             check_value(field, getattr(self, field.name))
             if field.metadata.get("pytree_node", True):
                 _check_single(field, getattr(self, field.name))
-        _check_task(self)
+        _check_problem(self.problem())
         if self.segment_length > self.rollout_length:
             raise ValueError(
                 f"segment_length {self.segment_length} is longer than what a round collects: "
@@ -275,9 +292,9 @@ def _check_single(field: dataclasses.Field, value: Any) -> None:
         )
 
 
-def _check_task(config: Config) -> None:
+def _check_problem(problem: Problem) -> None:
     """Raises ValueError if truth and belief aren't two values of the same parameters."""
-    _, params, belief = config.task()
+    params, belief = problem.params, problem.belief
     true, believed = (jax.tree.structure(tree) for tree in (params, belief))
     if true != believed:
         raise ValueError(f"belief {_kind(belief)} doesn't fit params {_kind(params)}: give both the same fields")

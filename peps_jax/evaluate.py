@@ -10,9 +10,8 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-import peps_envs
-from peps_jax import explicability, methods
-from peps_jax.config import Config
+from peps_jax import explicability
+from peps_jax.config import Problem
 from peps_jax.explicability import Score
 from peps_jax.train import Result
 
@@ -21,7 +20,7 @@ Policy = Callable[[Array, Array | None], tuple[Array, Array]]  # (observation, k
 
 @struct.dataclass
 class Evaluation:
-    """Episodes, one entry each: (num_episodes,). Events of the world are attributes too, e.g. `goal_reached`."""
+    """Episodes, one entry each: (num_episodes,). Events of the environment are attributes too, e.g. `goal_reached`."""
 
     score: Score
     log_policy: Array  # sum of log pi(a|s) relative to the uniform policy
@@ -68,48 +67,48 @@ class Evaluation:
         events = self.__dict__.get("events", {})
         if name in events:
             return events[name]
-        raise AttributeError(f"Evaluation has no {name!r}; this world's events are {', '.join(events)}")
+        raise AttributeError(f"Evaluation has no {name!r}; this environment's events are {', '.join(events)}")
 
 
 def evaluate(
-    result: Result, config: Config, num_episodes: int = 100, *, stochastic: bool = False, key: Array | None = None
+    result: Result,
+    num_episodes: int = 100,
+    *,
+    problem: Problem | None = None,
+    stochastic: bool = False,
+    key: Array | None = None,
 ) -> Evaluation:
     """Rolls out a learned policy and scores it. Pure.
 
     Args:
       result: of `train`.
-      config: world, method, belief and seed to evaluate in; usually the training's. "human_expectation" acts in the believed world.
       num_episodes: how many.
+      problem: domain to act in and belief to be scored by; those of the training by default. "human_expectation" acts in the
+        believed domain.
       stochastic: act by samples instead of the policy's mode.
-      key: random key; by default one that follows from `config.seed` and differs from the training's.
+      key: random key; by default one that follows from the training's seed and differs from the training's.
     """
-    environment, params, belief = methods.task(config)
-    key = jax.random.fold_in(jax.random.key(config.seed), 1) if key is None else key
-    return evaluate_policy(result.policy(), environment, params, belief, key, num_episodes, stochastic=stochastic)
+    problem = result.training.problem if problem is None else problem
+    key = jax.random.fold_in(jax.random.key(result.config.seed), 1) if key is None else key
+    return evaluate_policy(result.policy(), problem, key, num_episodes, stochastic=stochastic)
 
 
 def evaluate_policy(
-    policy: Policy,
-    environment: peps_envs.Environment,
-    params: Any,
-    belief: Any,
-    key: Array,
-    num_episodes: int,
-    *,
-    stochastic: bool = False,
+    policy: Policy, problem: Problem, key: Array, num_episodes: int, *, stochastic: bool = False
 ) -> Evaluation:
-    """`num_episodes` episodes of `policy` in `params`, scored for a human who believes `belief`."""
+    """`num_episodes` episodes of `policy` in `problem`, scored for a human who believes its belief."""
+    environment, params = problem.environment, problem.params
 
     def step(carry: tuple[Any, Array, Array], key: Array) -> tuple[tuple[Any, Array, Array], Any]:
         state, observation, alive = carry
         key_act, key_env = jax.random.split(key)
         action, log_policy = policy(observation, key_act if stochastic else None)
         after = environment.step(key_env, state, action, params)
-        score = explicability.score(environment, params, belief, state, action, after.state)
+        score = explicability.score(problem, state, action, after.state)
         hold = lambda new, old: jax.tree.map(lambda new, old: jnp.where(alive, new, old), new, old)
         next_state, next_observation = hold(after.state, state), hold(after.observation, observation)
         still = alive & ~(after.terminated | after.truncated)
-        row = (score, log_policy, jnp.ones(()), after.events)
+        row = (score, log_policy, jnp.ones((), jnp.float32), after.events)
         row = jax.tree.map(lambda values: jnp.where(alive, values, jnp.zeros_like(values)), row)
         return (next_state, next_observation, still), (row, environment.perceive(next_state))
 
@@ -125,7 +124,7 @@ def evaluate_policy(
             log_policy=log_policy,
             length=length,
             events={name: events[i] for i, name in enumerate(environment.event_names)},
-            perceived=jnp.concatenate([environment.perceive(state)[None], places]),
+            perceived=jnp.concatenate([environment.perceive(state)[None], places]).astype(jnp.float32),
         )
 
     return jax.vmap(episode)(jax.random.split(key, num_episodes))

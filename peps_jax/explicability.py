@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-import peps_envs
+from peps_jax.config import Problem
 from peps_jax.preferences import synthetic_human
 
 
@@ -39,18 +39,18 @@ class Score(NamedTuple):
         return self.human_return + self.belief_gap
 
 
-def score(
-    environment: peps_envs.Environment, params: Any, belief: Any, state: Any, action: Array, next_state: Any
-) -> Score:
-    """The score of one transition; every field is ()."""
-    log_belief, human_reward = synthetic_human.log_weight(environment, belief, state, action, next_state)
+def score(problem: Problem, state: Any, action: Array, next_state: Any) -> Score:
+    """The score of one transition; every field is () float32."""
+    environment, params = problem.environment, problem.params
+    log_belief, human_reward = synthetic_human.log_weight(environment, problem.belief, state, action, next_state)
     expected = environment.next_state_distribution(state, action, params)
-    return Score(
+    worth = Score(
         return_=environment.reward(state, action, next_state, params),
         human_return=human_reward,
         log_belief=log_belief,
         log_true=expected.relative_log_prob(environment.perceive(next_state)),
     )
+    return Score(*(jnp.asarray(value, jnp.float32) for value in worth))
 
 
 def episode_sums(values: Any, over: Array, running: Any) -> tuple[Any, Any]:

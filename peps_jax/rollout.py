@@ -10,9 +10,11 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from peps_jax import explicability, methods
-from peps_jax.config import Config
+import peps_envs
+from peps_jax import explicability
+from peps_jax.config import Problem
 from peps_jax.explicability import Score
+from peps_jax.settings import RolloutSettings
 from peps_jax.trajectory import Trajectory, Transition
 
 
@@ -32,18 +34,55 @@ class Actors:
     running: Running
 
 
-def init(key: Array, config: Config) -> Actors:
+def init(key: Array, problem: Problem, settings: RolloutSettings) -> Actors:
     """All environments at their start."""
-    environment, params, _ = methods.task(config)
-    state, observation = jax.vmap(environment.reset, in_axes=(0, None))(jax.random.split(key, config.num_envs), params)
-    zeros = jnp.zeros(config.num_envs)
-    return Actors(state=state, observation=observation, running=Running(Score(zeros, zeros, zeros, zeros), zeros))
+    reset = jax.vmap(problem.environment.reset, in_axes=(0, None))
+    state, observation = reset(jax.random.split(key, settings.num_envs), problem.params)
+    zeros = jnp.zeros(settings.num_envs, jnp.float32)
+    return Actors(state, _seen(observation), Running(Score(zeros, zeros, zeros, zeros), zeros))
+
+
+def exploring(
+    behave: Callable[[Array, Array], Array],
+    space: peps_envs.ActionSpace,
+    only: Array,
+    key: Array,
+    settings: RolloutSettings,
+) -> Callable[[Array, Array, Array], Array]:
+    """What `collect` acts by: `behave`, but for a share `exploration` of random actions; all are random where `only` holds.
+
+    A random action is held for `hold_steps`: a walk that turns at every step hardly leaves the start. Some are taken to the very
+    end: what the policy has abandoned would otherwise never be seen, asked about and valued again.
+
+    Args:
+      behave: (observations (num_envs, ...), key) -> actions (num_envs, ...).
+    """
+
+    def act(observation: Array, key_act: Array, time: Array) -> Array:
+        action = behave(observation, key_act)
+        key_uniform, key_explore = jax.random.split(jax.random.fold_in(key, time // settings.hold_steps))
+        uniform = jax.vmap(lambda key: random_action(space, key))(jax.random.split(key_uniform, settings.num_envs))
+        chance = jax.random.uniform(key_explore, (settings.num_envs,), jnp.float32)
+        return jax.vmap(jnp.where)((chance < settings.exploration) | only, uniform, action)
+
+    return act
+
+
+def random_action(space: peps_envs.ActionSpace, key: Array) -> Array:
+    """A uniformly random action."""
+    if isinstance(space, peps_envs.Discrete):
+        return jax.random.randint(key, (), 0, space.size, jnp.int32)
+    return jax.random.uniform(key, (space.size,), jnp.float32, minval=-1.0, maxval=1.0)
 
 
 def collect(
-    actors: Actors, act: Callable[[Array, Array, Array], Array], key: Array, config: Config
+    actors: Actors,
+    act: Callable[[Array, Array, Array], Array],
+    key: Array,
+    problem: Problem,
+    settings: RolloutSettings,
 ) -> tuple[Actors, Trajectory, dict[str, Array]]:
-    """`rollout_length` steps of every environment; an episode that ends is followed by a new one.
+    """`settings.length` steps of every environment; an episode that ends is followed by a new one.
 
     Args:
       act: (observations (num_envs, ...), key, step within the round) -> actions (num_envs, ...).
@@ -53,32 +92,32 @@ def collect(
       trajectory: all transitions, each with its own last observation, never the next episode's first.
       info: means over the episodes that ended in this round, and their number, `episodes`; where that is 0 they are 0.
     """
-    environment, params, belief = methods.task(config)
+    environment, params = problem.environment, problem.params
     reset = jax.vmap(environment.reset, in_axes=(0, None))
     step = jax.vmap(environment.step, in_axes=(0, 0, 0, None))
+    split = lambda key: jax.random.split(key, settings.num_envs)
 
     def step_all(carry: tuple[Any, Array], now: tuple[Array, Array]) -> tuple[tuple[Any, Array], Trajectory]:
         state, observation = carry
         time, key = now
         key_act, key_env, key_reset = jax.random.split(key, 3)
         action = act(observation, key_act, time)
-        after = step(jax.random.split(key_env, config.num_envs), state, action, params)
-        over = after.terminated | after.truncated
-        start, first = reset(jax.random.split(key_reset, config.num_envs), params)
+        after = step(split(key_env), state, action, params)
+        seen, over = _seen(after.observation), after.terminated | after.truncated
+        start, first = reset(split(key_reset), params)
         restart = lambda new, old: jax.vmap(jnp.where)(over, new, old)
-        transition = Transition(
-            observation, action, after.reward, after.observation, after.terminated.astype(jnp.float32)
-        )
+        moved = jax.vmap(movement, in_axes=(0, 0, None))(state, after.state, problem)
+        transition = Transition(observation, action, after.reward, seen, moved, after.terminated)
         row = Trajectory(transition, after.truncated, after.events, state, after.state)
-        return (jax.tree.map(restart, start, after.state), restart(first, after.observation)), row
+        return (jax.tree.map(restart, start, after.state), restart(_seen(first), seen)), row
 
-    keys = jax.random.split(key, config.rollout_length)
-    times = jnp.arange(config.rollout_length)
+    times = jnp.arange(settings.length, dtype=jnp.int32)
+    keys = jax.random.split(key, settings.length)
     (state, observation), trajectory = jax.lax.scan(step_all, (actors.state, actors.observation), (times, keys))
 
-    score = jax.vmap(jax.vmap(lambda *transition: explicability.score(environment, params, belief, *transition)))
+    score = jax.vmap(jax.vmap(lambda *transition: explicability.score(problem, *transition)))
     scores = score(trajectory.state, trajectory.transition.action, trajectory.next_state)
-    over = (trajectory.transition.terminated > 0) | trajectory.truncated
+    over = trajectory.transition.terminated | trajectory.truncated
     values = Running(scores, jnp.ones_like(scores.return_))
     totals, running = explicability.episode_sums(values, over, actors.running)
     return (
@@ -88,15 +127,26 @@ def collect(
     )
 
 
+def movement(state: Any, next_state: Any, problem: Problem) -> Array:
+    """How the perceived state moves in a step, in units of sigma_p, (perceived_size,): what T_A predicts."""
+    perceive, width = problem.environment.perceive, problem.environment.perception_width(problem.params)
+    return ((perceive(next_state) - perceive(state)) / width).astype(jnp.float32)
+
+
+def _seen(observation: Array) -> Array:
+    """What the agent is given: 32-bit floats, whatever the environment computes with."""
+    return observation.astype(jnp.float32)
+
+
 def _episode_means(totals: Running, over: Array, events: Array, names: tuple[str, ...]) -> dict[str, Array]:
-    number = jnp.sum(over)
-    mean = lambda values: jnp.sum(jnp.where(over, values, 0.0)) / jnp.maximum(number, 1)
+    number = jnp.sum(over, dtype=jnp.float32)
+    mean = lambda values: jnp.sum(jnp.where(over, values, 0.0), dtype=jnp.float32) / jnp.maximum(number, 1)
     info = {
         "return_": mean(totals.score.return_),
         "explicability": mean(totals.score.explicability),
         "belief_gap": mean(totals.score.belief_gap),
         "human_return": mean(totals.score.human_return),
         "length": mean(totals.length),
-        "episodes": number.astype(jnp.float32),
+        "episodes": number,
     }
     return info | {name: mean(events[..., i]) for i, name in enumerate(names)}

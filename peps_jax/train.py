@@ -1,8 +1,8 @@
 """A training: the paper's Algorithm 1 as one pure function of a `Config`.
 
 `train` scans over rounds. A round has two halves with the teacher between them: `collect_and_ask` ends with queries,
-`learn_and_improve` begins with preferences. A host loop may run rounds one by one (`run_round`), or the halves with a person
-in between, and gets the same numbers as the scan.
+`learn_and_improve` begins when their answers are filed. A host loop may run rounds one by one (`run_round`), or the halves with
+a person in between (a host teacher), and gets the same numbers as the scan.
 """
 
 from __future__ import annotations
@@ -16,14 +16,31 @@ from flax import struct
 from jax import Array
 
 from peps_jax import methods, rollout
-from peps_jax.config import Config
+from peps_jax.config import Config, Problem
 from peps_jax.learning import replay, sac
-from peps_jax.preferences import synthetic_human
-from peps_jax.trajectory import Preferences, Segments, Transition
+from peps_jax.learning.surrogate import SurrogateState
+from peps_jax.methods import Method
+from peps_jax.preferences import data
+from peps_jax.preferences.data import Answers, PreferenceSet, Queries
+from peps_jax.preferences.teachers import SYNTHETIC, Teacher
+from peps_jax.round import Round, round_at
+from peps_jax.settings import Settings, settings_of
+from peps_jax.trajectory import Transition
 
 # Minibatches whose rewards are computed at once. All of a round's took two to three times as long on a CPU: what the ensembles'
 # layers put out didn't stay in the cache.
 VALUED_TOGETHER = 5
+
+
+@struct.dataclass
+class Training:
+    """What rounds are run with: everything that a `Config` names, resolved once."""
+
+    config: Config
+    method: Method = struct.field(pytree_node=False)
+    problem: Problem  # that the method acts in
+    settings: Settings
+    answer: Callable[..., Answers] = struct.field(pytree_node=False)  # who answers a round's queries inside the program
 
 
 @struct.dataclass
@@ -32,6 +49,10 @@ class TrainingState:
 
     agents: tuple[sac.Agent, ...]  # one for each of the method's rewards; they act together
     knowledge: Any  # what the method learns beside the policies
+    preferences: PreferenceSet | None  # None of a method that uses none
+    budget: (
+        Array | None
+    )  # () int32, queries that are asked in all; a value, so that a recording teaches by the same program
     replay: Transition
     actors: rollout.Actors
     key: Array
@@ -41,10 +62,21 @@ class TrainingState:
 class Result:
     """A finished training, ready to act."""
 
+    training: Training
     agents: tuple[sac.Agent, ...]
     knowledge: Any
+    preferences: PreferenceSet | None  # that r-hat was fitted to
     curves: dict[str, Array]  # (rounds,) each
-    config: Config
+
+    @property
+    def config(self) -> Config:
+        """What was asked for."""
+        return self.training.config
+
+    @property
+    def surrogate(self) -> SurrogateState | None:
+        """r-hat; None of a method that learns none."""
+        return self.training.method.surrogate(self.knowledge)
 
     def act(self, observation: Array, key: Array | None = None) -> Array:
         """The action for one observation: the policy's mode, or a sample if a key is given."""
@@ -54,9 +86,10 @@ class Result:
         """(observation, key or None) -> the action and l_pi, log pi(a|s) relative to the uniform policy."""
 
         def policy(observation: Array, key: Array | None) -> tuple[Array, Array]:
+            observation = jnp.asarray(observation, jnp.float32)
             if key is None:
-                return sac.mode(self.agents, observation, self.config)
-            return sac.act(self.agents, observation, key, self.config)
+                return sac.mode(self.agents, observation, self.training.settings.agent)
+            return sac.act(self.agents, observation, key, self.training.settings.agent)
 
         return policy
 
@@ -67,154 +100,167 @@ def check(config: Config) -> None:
     config.check()
 
 
-def init(config: Config) -> TrainingState:
-    """The state before the first round."""
-    key_agent, key_knowledge, key_actors, key = jax.random.split(jax.random.key(config.seed), 4)
-    environment, _, _ = config.task()
+def prepare(config: Config, teacher: Teacher = SYNTHETIC) -> Training:
+    """Resolves what `config` names: the method, the problem, and every part's settings."""
     method = methods.get(config.method)
+    problem = method.acts_in(config.problem())
+    settings = method.settings(settings_of(config, problem))
+    return Training(config, method, problem, settings, teacher.answer)
+
+
+def init(training: Training, teacher: Teacher = SYNTHETIC) -> TrainingState:
+    """The state before the first round, with what the teacher has said before."""
+    settings, method = training.settings, training.method
+    key_agent, key_knowledge, key_actors, key = jax.random.split(jax.random.key(training.config.seed), 4)
+    spaces = settings.agent.observation_size, settings.agent.action_space
+    preferences = budget = None
+    if method.asks:
+        room = data.empty(settings.queries.room, settings.queries.segment_length, *spaces)
+        preferences = data.before(teacher.recorded, room, teacher.asks)
+        budget = jnp.asarray(settings.queries.budget if teacher.asks else 0, jnp.int32)
+    capacity = settings.schedule.num_rounds * settings.schedule.steps_per_round
     return TrainingState(
-        agents=tuple(sac.init(key, config) for key in _keys(key_agent, len(method.rewards))),
-        knowledge=method.init(key_knowledge, config),
-        replay=replay.init(config.num_rounds * config.steps_per_round, environment),
-        actors=rollout.init(key_actors, config),
+        agents=tuple(sac.init(key, settings.agent) for key in sac.agent_keys(key_agent, len(method.rewards))),
+        knowledge=method.init(key_knowledge, settings),
+        preferences=preferences,
+        budget=budget,
+        replay=replay.init(capacity, *spaces, settings.dynamics.perceived_size),
+        actors=rollout.init(key_actors, training.problem, settings.rollout),
         key=key,
     )
 
 
+# --- a round --------------------------------------------------------------------------------------------------------------
+
+
 def collect_and_ask(
-    state: TrainingState, index: Array, config: Config
-) -> tuple[TrainingState, Segments | None, dict[str, Array]]:
-    """The first half of round `index`: act, remember, and choose what to ask. Queries are None from a method that asks nothing."""
-    key_act, key_ask, _, _, _ = _round_keys(state, index)
-    key_act, key_hold = jax.random.split(key_act)
-    parts, _, _ = sac.networks(config)
-    env = jnp.arange(config.num_envs)
-    # Where several policies act together, each acts alone too, in environments of its own: SAC goes astray with a policy
-    # whose actions it never sees carried out.
-    alone = [(agent,) for agent in state.agents]
-    teams = alone if len(alone) == 1 else [state.agents, *alone]
-
-    def act(observation: Array, key: Array, time: Array) -> Array:
-        keys = _keys(key, len(teams))
-        actions = [sac.act(team, observation, key, config)[0] for team, key in zip(teams, keys, strict=True)]
-        action = jnp.stack(actions, 1)[env, env % len(teams)]
-        # A random action is held: a walk that turns at every step hardly leaves the start. Some are taken to the very end:
-        # what the policy has abandoned would otherwise never be seen, asked about and valued again.
-        key_uniform, key_explore = jax.random.split(jax.random.fold_in(key_hold, time // config.hold_steps))
-        uniform = jax.vmap(parts.uniform)(jax.random.split(key_uniform, config.num_envs))
-        exploring = jax.random.uniform(key_explore, (config.num_envs,)) < config.exploration
-        return jax.vmap(jnp.where)(exploring | (index < config.warmup_rounds), uniform, action)
-
-    actors, trajectory, info = rollout.collect(state.actors, act, key_act, config)
+    state: TrainingState, now: Round, training: Training
+) -> tuple[TrainingState, Queries | None, dict[str, Array]]:
+    """The first half of a round: act, remember, and choose what to ask. Queries are None of a method that asks nothing."""
+    settings, method = training.settings, training.method
+    key_act, key_hold = jax.random.split(now.keys.act)
+    behave = lambda observation, key: method.behave(state.agents, observation, key, settings.agent)
+    act = rollout.exploring(behave, settings.agent.action_space, now.explores_only, key_hold, settings.rollout)
+    actors, trajectory, info = rollout.collect(state.actors, act, key_act, training.problem, settings.rollout)
     flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), trajectory.transition)
-    buffer = replay.add(state.replay, flat, index * config.steps_per_round)
-    queries = methods.get(config.method).ask(state.knowledge, trajectory, key_ask, config)
-    return state.replace(actors=actors, replay=buffer), queries, info
+    state = state.replace(actors=actors, replay=replay.add(state.replay, flat, now.position))
+    if not method.asks:
+        return state, None, info
+    segments = method.ask(state.knowledge, trajectory, now.keys.ask, settings)
+    preferences, queries = data.ask(state.preferences, segments, now.index, settings.queries.room, state.budget)
+    return state.replace(preferences=preferences), queries, info
 
 
-def learn_and_improve(
-    state: TrainingState, index: Array, preferences: Preferences | None, config: Config
-) -> tuple[TrainingState, dict[str, Array]]:
-    """The second half of round `index`: learn from replay and preferences, then improve the policy."""
-    _, _, _, key_learn, key_improve = _round_keys(state, index)
-    filled = (index + 1) * config.steps_per_round
-    knowledge, learned = methods.get(config.method).learn(
-        state.knowledge, state.replay, filled, preferences, index, key_learn, config
-    )
+def hear(state: TrainingState, answers: Answers, now: Round) -> TrainingState:
+    """Files what a teacher said."""
+    return state.replace(preferences=data.file(state.preferences, answers, now.index))
+
+
+def learn_and_improve(state: TrainingState, now: Round, training: Training) -> tuple[TrainingState, dict[str, Array]]:
+    """The second half of a round: learn from replay and from what was answered so far, then improve the policy."""
+    preferences = None if state.preferences is None else data.known(state.preferences, now.index)
+    learn = training.method.learn
+    knowledge, learned = learn(state.knowledge, state.replay, preferences, now, training.settings)
     state = state.replace(knowledge=knowledge)
-    agents, improved = improve(state, index, key_improve, config)
+    agents, improved = improve(state, now, training)
     return state.replace(agents=agents), learned | improved
 
 
-def improve(
-    state: TrainingState, index: Array, key: Array, config: Config
-) -> tuple[tuple[sac.Agent, ...], dict[str, Array]]:
+def improve(state: TrainingState, now: Round, training: Training) -> tuple[tuple[sac.Agent, ...], dict[str, Array]]:
     """SAC updates of one round: every agent sees the same minibatches, with its own reward by what the method knows now."""
-    method = methods.get(config.method)
-    key_batch, key_update = jax.random.split(key)
-    filled = (index + 1) * config.steps_per_round
-    shape = (config.updates_per_round, config.batch_size)
-    batches = replay.sample(state.replay, key_batch, shape, filled)
-    temperature = (annealed_temperature(index, config) + method.entropy_weight(config)) * config.reward_scale
-
-    slower = config.replace(learning_rate=faded_learning_rate(index, config))
+    method, settings = training.method, training.settings
+    key_batch, key_update = jax.random.split(now.keys.improve)
+    shape = (settings.agent.updates, settings.agent.batch_size)
+    batches = replay.sample(state.replay, key_batch, shape, now.filled)
+    temperature = (now.temperature + method.entropy_weight(settings)) * settings.agent.reward_scale
+    current = settings.agent.replace(learning_rate=now.learning_rate)
 
     def update(agent: sac.Agent, step: tuple[Transition, sac.Noise]) -> tuple[sac.Agent, dict[str, Array]]:
         batch, noise = step
-        return sac.update(agent, batch, temperature, noise, slower)
+        return sac.update(agent, batch, temperature, noise, current)
 
     agents, infos = [], []
-    for agent, reward, key in zip(state.agents, method.rewards, _keys(key_update, len(method.rewards)), strict=True):
+    keys = sac.agent_keys(key_update, len(method.rewards))
+    for agent, reward, key in zip(state.agents, method.rewards, keys, strict=True):
         # before the updates: what the method knows doesn't change within a round
-        valued = batches._replace(reward=value(reward, state.knowledge, batches, config) * config.reward_scale)
-        agent, info = jax.lax.scan(update, agent, (valued, sac.draw_noise(key, shape, config)))
+        rewards = value(reward, state.knowledge, batches, settings) * settings.agent.reward_scale
+        noise = sac.draw_noise(key, shape, settings.agent)
+        agent, info = jax.lax.scan(update, agent, (batches._replace(reward=rewards), noise))
         agents.append(agent)
         infos.append(info)
     return tuple(agents), jax.tree.map(lambda *values: jnp.mean(jnp.stack(values)), *infos)
 
 
 def value(
-    reward: Callable[[Any, Transition, Config], Array], knowledge: Any, batches: Transition, config: Config
+    reward: Callable[[Any, Transition, Settings], Array], knowledge: Any, batches: Transition, settings: Settings
 ) -> Array:
     """A method's `reward` of minibatches (n, size), `VALUED_TOGETHER` at a time."""
-    return jax.lax.map(lambda batch: reward(knowledge, batch, config), batches, batch_size=VALUED_TOGETHER)
+    return jax.lax.map(lambda batch: reward(knowledge, batch, settings), batches, batch_size=VALUED_TOGETHER)
 
 
-def annealed_temperature(index: Array, config: Config) -> Array:
-    """SAC's own temperature in round `index`, in reward units: from `initial_temperature` to `temperature`, geometrically."""
-    done = jnp.clip(index / jnp.maximum(config.anneal_share * config.num_rounds, 1.0), 0.0, 1.0)
-    first, last = jnp.maximum(config.initial_temperature, 1e-6), jnp.maximum(config.temperature, 1e-6)
-    return jnp.exp((1 - done) * jnp.log(first) + done * jnp.log(last))
-
-
-def faded_learning_rate(index: Array, config: Config) -> Array:
-    """SAC's learning rate in round `index`: whole at first, then falling linearly to a tenth at the end.
-
-    Late in a training a full step trades one of two nearly equal ways for the other.
-    """
-    left = 1 - index / config.num_rounds
-    return config.learning_rate * jnp.clip(left / jnp.maximum(config.fade_share, 1e-6), 0.1, 1.0)
-
-
-def run_round(
-    state: TrainingState, index: Array, config: Config, teacher: synthetic_human.Teacher = synthetic_human.SYNTHETIC
-) -> tuple[TrainingState, dict[str, Array]]:
-    """Round `index` with a teacher that answers inside the program; returns the state and the round's figures."""
-    state, queries, collected = collect_and_ask(state, index, config)
-    _, _, key_teacher, _, _ = _round_keys(state, index)
-    preferences = None if queries is None else teacher.answer(key_teacher, queries, config)
-    state, learned = learn_and_improve(state, index, preferences, config)
+def run_round(state: TrainingState, index: Array, training: Training) -> tuple[TrainingState, dict[str, Array]]:
+    """Round `index`, with a teacher that answers inside the program; returns the state and the round's figures."""
+    now = round_at(index, state.key, training.settings.schedule)
+    state, queries, collected = collect_and_ask(state, now, training)
+    if queries is not None:
+        answers = training.answer(now.keys.answer, queries, training.problem, training.settings.human)
+        state = hear(state, answers, now)
+    state, learned = learn_and_improve(state, now, training)
     return state, collected | learned
 
 
-def run_rounds(
-    state: TrainingState, indices: Array, config: Config, teacher: synthetic_human.Teacher = synthetic_human.SYNTHETIC
-) -> tuple[TrainingState, dict[str, Array]]:
+def run_rounds(state: TrainingState, indices: Array, training: Training) -> tuple[TrainingState, dict[str, Array]]:
     """Rounds `indices` (n,) one after the other: the state after them, and curves (n,)."""
-    return jax.lax.scan(lambda state, index: run_round(state, index, config, teacher), state, indices)
+    return jax.lax.scan(lambda state, index: run_round(state, index, training), state, indices)
 
 
-def train(config: Config, teacher: synthetic_human.Teacher = synthetic_human.SYNTHETIC) -> Result:
-    """A whole training. Pure: works under `jax.jit`, `jax.vmap` (over any traced leaves of `config`) and in a scan.
+# --- the whole ------------------------------------------------------------------------------------------------------------
+
+
+def train(config: Config, teacher: Teacher = SYNTHETIC) -> Result:
+    """A whole training.
+
+    Pure: works under `jax.jit`, `jax.vmap` (over any traced leaves of `config`) and in a scan, unless the teacher is outside
+    the program (`teachers.host`).
 
     Raises:
-      ValueError: a setting makes no sense; one line says which, its value, and what would be right.
+      ValueError: a setting makes no sense, or recorded preferences don't fit; one line says which, and what would be right.
     """
     check(config)
-    state, curves = run_rounds(init(config), jnp.arange(config.num_rounds), config, teacher)
-    return finish(state, curves, config)
+    training = prepare(config, teacher)
+    teacher.check(training.method.asks, training.settings)
+    state = init(training, teacher)
+    if teacher.host is not None:
+        return finish(*_run_with_host(state, training, teacher.host), training)
+    indices = jnp.arange(training.settings.schedule.num_rounds, dtype=jnp.int32)
+    return finish(*_run_rounds(state, indices, training), training)
 
 
-def finish(state: TrainingState, curves: dict[str, Array], config: Config) -> Result:
+def finish(state: TrainingState, curves: dict[str, Array], training: Training) -> Result:
     """What remains of a training when its rounds are done."""
-    return Result(agents=state.agents, knowledge=state.knowledge, curves=curves, config=config)
+    return Result(training, state.agents, state.knowledge, state.preferences, curves)
 
 
-def _keys(key: Array, number: int) -> list[Array]:
-    """A key for each of `number` agents. The first one's is `key` itself: others don't change its numbers."""
-    return [key, *(jax.random.fold_in(key, other) for other in range(1, number))]
+# compiled once for every structure, whoever teaches, where the caller doesn't compile: so a recording has its teacher's bits
+_run_rounds = jax.jit(run_rounds)
+_halves = jax.jit(collect_and_ask), jax.jit(hear), jax.jit(learn_and_improve)
 
 
-def _round_keys(state: TrainingState, index: Array) -> Array:
-    """Keys of round `index`: acting, asking, answering, learning, improving. The same from every half."""
-    return jax.random.split(jax.random.fold_in(state.key, index), 5)
+def _run_with_host(
+    state: TrainingState, training: Training, host: Callable[[Queries, int], Answers | None]
+) -> tuple[TrainingState, dict[str, Array]]:
+    """All rounds, with `host` called between the halves of each."""
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((state, training))):
+        raise ValueError("teacher is outside the program: train can't be inside jax.jit, jax.vmap or a scan then")
+    first_half, file, second_half = _halves
+    rows = []
+    for index in range(training.settings.schedule.num_rounds):
+        now = round_at(jnp.asarray(index, jnp.int32), state.key, training.settings.schedule)
+        state, queries, collected = first_half(state, now, training)
+        said = None if queries is None else host(jax.device_get(queries), index)
+        if said is not None:
+            answers = data.checked(said, training.settings.queries.per_round)
+            state = file(state, answers, now)
+        state, learned = second_half(state, now, training)
+        rows.append(jax.device_get(collected | learned))
+    return state, jax.tree.map(lambda *values: jnp.stack(values), *rows)

@@ -27,6 +27,9 @@ from jax import Array
 import peps_jax
 from peps_envs import ActionSpace, Box, Discrete, Environment, Gaussian, Step
 from peps_jax import Config
+from peps_jax.execution.program import FinishedRun
+from peps_jax.settings import Settings
+from peps_jax.train import init, prepare
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -92,9 +95,6 @@ class Line(Environment):
     def perceive(self, state: Point) -> Array:
         return state.place
 
-    def perceive_observation(self, observation: Array, params: LineParams) -> Array:
-        return observation
-
     def perception_width(self, params: LineParams) -> Array:
         return jnp.broadcast_to(jnp.asarray(params.width), (1,))
 
@@ -141,9 +141,6 @@ class Probe(Environment):
     def perceive(self, state: Point) -> Array:
         return state.place
 
-    def perceive_observation(self, observation: Array, params: ProbeParams) -> Array:
-        return observation
-
     def perception_width(self, params: ProbeParams) -> Array:
         return jnp.ones(1)
 
@@ -155,6 +152,18 @@ TINY = dict(
     surrogate_batch_size=8, num_queries=20, segment_length=5, min_segment_length=1, query_strategy="information_gain",
     candidates_per_query=10, level="none", tune_temperature=False, reward_scale=1.0,
 )  # fmt: skip
+
+
+def settings(config: Config) -> Settings:
+    """Every part's settings."""
+    return prepare(config).settings
+
+
+def untrained(config: Config) -> FinishedRun:
+    """A run as a sweep has them, of an agent that has learned nothing yet."""
+    training = prepare(config)
+    state = jax.jit(init)(training)
+    return FinishedRun(training, state.agents, state.knowledge, state.preferences, curves={})
 
 
 @pytest.fixture(scope="session")

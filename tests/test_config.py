@@ -1,10 +1,12 @@
 """Settings: one clear line for each that makes no sense, and what is traced or static."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import Line, LineParams
+from conftest import Line, LineParams, settings
 
 import peps_jax
 from peps_jax import Config, grid
@@ -13,6 +15,8 @@ from peps_jax.train import check
 WRONG = [
     ("query_strategy", "information", "information_gain"),
     ("level", "maximum", "max"),
+    ("entropies", "relatif", "relative"),
+    ("dynamics_batch_size", 0, "a whole number from 1 to"),
     ("num_envs", 0, "a whole number from 1 to"),
     ("num_envs", 2.5, "a whole number from 1 to"),
     ("total_steps", -1, "a whole number from 1 to"),
@@ -92,7 +96,7 @@ def test_unknown_names_get_the_nearest(tiny):
 @pytest.mark.parametrize("missing", ["params", "belief"])
 def test_an_environment_object_needs_params_and_belief(line, missing):
     with pytest.raises(ValueError, match=f"{missing} is None") as error:
-        line.replace(**{missing: None}).task()
+        line.replace(**{missing: None}).problem()
     one_line(error)
 
 
@@ -102,13 +106,42 @@ def test_a_good_configuration_passes(tiny, line):
 
 
 def test_belief_by_name_and_by_value(tiny):
-    environment, params, belief = tiny.task()
-    assert float(belief.pit_noise) > 0, "the task's first belief is the biased one"
-    _, _, unbiased = tiny.replace(belief="unbiased").task()
-    jax.tree.map(np.testing.assert_array_equal, unbiased, params)
-    own = params.replace(sand_gain=jnp.asarray(0.5))
-    assert tiny.replace(belief=own).task()[2] is own
-    assert environment == tiny.task()[0]
+    problem = tiny.problem()
+    assert float(problem.belief.pit_noise) > 0, "the task's first belief is the biased one"
+    unbiased = tiny.replace(belief="unbiased").problem().belief
+    jax.tree.map(np.testing.assert_array_equal, unbiased, problem.params)
+    own = problem.params.replace(sand_gain=jnp.asarray(0.5))
+    assert tiny.replace(belief=own).problem().belief is own
+    assert problem.environment == tiny.problem().environment
+
+
+def test_every_field_has_a_check_and_a_help_text():
+    named = {"env", "method", "params", "belief"}  # looked up, or compared with one another
+    for field in dataclasses.fields(Config):
+        assert field.metadata["help"], field.name
+        assert field.metadata["group"], field.name
+        assert (field.metadata["right"] is None) == (field.name in named), field.name
+
+
+def test_every_field_reaches_a_part(tiny):
+    """Other values of a field make other settings: none is read by nobody."""
+    told = settings(tiny)
+    same = lambda one, other: (
+        jax.tree.structure(one) == jax.tree.structure(other)
+        and all(np.array_equal(*pair) for pair in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True))
+    )
+    for field in dataclasses.fields(Config):
+        if field.name in ("env", "method", "seed", "params", "belief"):
+            continue
+        value = getattr(tiny, field.name)
+        others = {
+            bool: lambda value: not value,
+            int: lambda value: 7 * value + 80,
+            float: lambda value: 0.37 if not np.isfinite(value) else 0.5 * value + 0.13,
+            tuple: lambda value: (*value, 3),
+            str: lambda value, field=field: next(one for one in field.metadata["choices"] if one != value),
+        }
+        assert not same(settings(tiny.replace(**{field.name: others[type(value)](value)})), told), field.name
 
 
 def test_rounds_cover_the_steps_and_the_queries(tiny):

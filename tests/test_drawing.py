@@ -7,16 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import LineParams, Point
+from conftest import LineParams, Point, untrained
 from matplotlib.colors import to_hex
 
 import peps_envs
 from peps_envs.scene import Circle, Polyline, Rectangle, Scene, Text
 from peps_jax import evaluate, methods
 from peps_jax.drawing import navigation_map, panels, scenes
-from peps_jax.execution.batches import Finished
 from peps_jax.sweep import pictures, results
-from peps_jax.train import finish, init
 
 SHAPES = (
     Rectangle(2.0, 1.0, 2.0, 1.0, "agent", angle=np.pi / 2, outline="ink"),
@@ -153,10 +151,10 @@ def test_a_map_is_navigations_scene_without_the_agent(heat):
 
 def rows_of(config, name):
     """An untrained agent of `config` with what it does, as a sweep has them."""
-    result = finish(jax.jit(init)(config), {}, config)
-    evaluation = jax.jit(evaluate, static_argnames="num_episodes")(result, config, num_episodes=2)
-    evaluation = jax.tree.map(np.asarray, evaluation)
-    return [results.Row(results.Cell(name, config.method, 1.0, 0, "any"), Finished(result, evaluation, failed=False))]
+    run = untrained(config)
+    evaluation = jax.jit(evaluate, static_argnames="num_episodes")(run, num_episodes=2)
+    run = run.replace(evaluation=jax.tree.map(np.asarray, evaluation))
+    return [results.Row(results.Cell(name, config.method, 1.0, 0, "any"), run)]
 
 
 def test_an_environment_without_a_picture_shows_its_perceived_state_over_time(line):
@@ -165,7 +163,7 @@ def test_an_environment_without_a_picture_shows_its_perceived_state_over_time(li
     )
     (axes,) = pictures.routes(rows).axes
     assert (axes.get_title(), axes.get_ylabel()) == ("sac", "line")
-    evaluation = row.finished.evaluation
+    evaluation = row.run.evaluation
     assert len(axes.lines) == 2
     for shown, perceived, length in zip(axes.lines, evaluation.perceived, evaluation.length, strict=True):
         moved = (perceived[: int(length) + 1, 0] - perceived[0, 0]) / 0.5  # in perceptual widths
@@ -185,6 +183,6 @@ def test_navigation_shows_routes_on_its_map(tiny):
     (row,) = rows = rows_of(tiny.replace(method="sac"), "nav-d1")
     (axes,) = pictures.routes(rows, episodes=1).axes
     route, start = axes.lines
-    length = int(row.finished.evaluation.length[0])
-    np.testing.assert_allclose(route.get_xydata(), row.finished.evaluation.perceived[0, : length + 1])
+    length = int(row.run.evaluation.length[0])
+    np.testing.assert_allclose(route.get_xydata(), row.run.evaluation.perceived[0, : length + 1])
     np.testing.assert_allclose(start.get_xydata(), [jnp.asarray(peps_envs.make("nav-d1").params.start)])

@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import LineParams
+from conftest import LineParams, Point, settings
 
+from peps_jax import rollout
 from peps_jax.learning import dynamics
 from peps_jax.trajectory import Transition
 
@@ -15,10 +16,12 @@ WIDTH = 0.1
 
 @pytest.fixture(scope="module")
 def config(line):
-    return line.replace(
-        dynamics_updates=800, dynamics_learning_rate=5e-3, batch_size=64, model_hidden_sizes=(16,), ensemble_size=2,
-        params=LineParams(width=WIDTH),
-    )  # fmt: skip
+    return settings(
+        line.replace(
+            dynamics_updates=800, dynamics_learning_rate=5e-3, dynamics_batch_size=64, model_hidden_sizes=(16,),
+            ensemble_size=2, params=LineParams(width=WIDTH),
+        )
+    ).dynamics  # fmt: skip
 
 
 @jax.jit
@@ -27,14 +30,14 @@ def fitted(noise, config):
     key_data, key_noise, key_init, key_fit = jax.random.split(jax.random.key(0), 4)
     observation, action = jax.random.uniform(key_data, (2, NUMBER, 1), minval=-1.0)
     after = observation + 0.1 * action + noise * jax.random.normal(key_noise, (NUMBER, 1))
-    replay = Transition(observation, action, jnp.zeros(NUMBER), after, jnp.zeros(NUMBER))
+    moved = (after - observation) / WIDTH
+    replay = Transition(observation, action, jnp.zeros(NUMBER), after, moved, jnp.zeros(NUMBER, bool))
     return dynamics.fit(dynamics.init(key_init, config), replay, NUMBER, key_fit, config)
 
 
 def test_movement_is_in_units_of_the_perceptual_width(line):
-    environment, params, _ = line.task()
-    transition = Transition(jnp.array([0.2]), jnp.zeros(1), jnp.zeros(()), jnp.array([0.25]), jnp.zeros(()))
-    np.testing.assert_allclose(dynamics.movement(transition, environment, params), [0.05 / WIDTH], rtol=1e-5)
+    before, after = Point(jnp.array([0.2]), jnp.int32(0)), Point(jnp.array([0.25]), jnp.int32(1))
+    np.testing.assert_allclose(rollout.movement(before, after, line.problem()), [0.05 / WIDTH], rtol=1e-5)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.2])
@@ -57,9 +60,10 @@ def test_loss_is_the_negative_log_likelihood(config):
     state = dynamics.init(jax.random.key(0), config)
     member = jax.tree.map(lambda leaf: leaf[0], state.params)
     observation, action, after = jnp.array([[0.1], [0.3]]), jnp.array([[0.5], [-1.0]]), jnp.array([[0.2], [0.1]])
-    batch = Transition(observation, action, jnp.zeros(2), after, jnp.zeros(2))
+    moved = (after - observation) / WIDTH
+    batch = Transition(observation, action, jnp.zeros(2), after, moved, jnp.zeros(2, bool))
     prediction = dynamics.predict(member, observation, action, config)
-    moved, sd = (after - observation) / WIDTH, jnp.exp(prediction.log_sd)
+    sd = jnp.exp(prediction.log_sd)
     density = -0.5 * ((moved - prediction.mean) / sd) ** 2 - prediction.log_sd - 0.5 * np.log(2 * np.pi)
     np.testing.assert_allclose(dynamics.loss(member, batch, config), -jnp.mean(density), rtol=1e-5)
 

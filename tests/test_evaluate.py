@@ -10,6 +10,7 @@ from conftest import Line, LineParams
 
 import peps_jax
 from peps_jax import explicability
+from peps_jax.config import Problem
 from peps_jax.evaluate import evaluate_policy
 
 EPISODES = 6
@@ -24,7 +25,7 @@ def evaluate():
 def navigation(tiny, train, evaluate):
     """D1 with a hardly trained SAC policy that acts at random: the arrays of a real world."""
     config = tiny.replace(method="sac")
-    return evaluate(train(config), config, num_episodes=EPISODES, stochastic=True)
+    return evaluate(train(config), num_episodes=EPISODES, stochastic=True)
 
 
 def constant(value, log_policy=0.0):
@@ -34,7 +35,7 @@ def constant(value, log_policy=0.0):
 
 # the policy is code, so every one of them is another program
 line_episodes = functools.partial(jax.jit, static_argnums=0)(
-    lambda policy, params, belief, key: evaluate_policy(policy, Line(), params, belief, key, EPISODES)
+    lambda policy, params, belief, key: evaluate_policy(policy, Problem(Line(), params, belief), key, EPISODES)
 )
 
 
@@ -94,34 +95,33 @@ def test_time_runs_out():
 
 def test_repeats_are_equal_and_other_keys_are_not(line, train, evaluate):
     result = train(line)
-    one, two = (evaluate(result, line, num_episodes=EPISODES) for _ in range(2))
+    one, two = (evaluate(result, num_episodes=EPISODES) for _ in range(2))
     jax.tree.map(np.testing.assert_array_equal, one, two)
-    other = evaluate(result, line, num_episodes=EPISODES, key=jax.random.key(9))
+    other = evaluate(result, num_episodes=EPISODES, key=jax.random.key(9))
     assert not np.array_equal(one.return_, other.return_)
-    sampled = evaluate(result, line, num_episodes=EPISODES, stochastic=True)
+    sampled = evaluate(result, num_episodes=EPISODES, stochastic=True)
     np.testing.assert_array_equal(one.perceived[:, 0], sampled.perceived[:, 0])
     assert not np.array_equal(one.return_, sampled.return_)
 
 
 def test_evaluation_is_pure(line, train, evaluate):
-    """Under vmap over seeds, a cell's episodes are those of its single run."""
-    configs = peps_jax.grid(line, seed=[0, 3])
-    result = train(line)
-    batch = jax.jit(jax.vmap(lambda config: peps_jax.evaluate(result, config, EPISODES)))(configs)
-    single = evaluate(result, line.replace(seed=3), num_episodes=EPISODES)
+    """Under vmap over keys, each one's episodes are those that it has alone."""
+    result, keys = train(line), jax.random.split(jax.random.key(3), 2)
+    batch = jax.jit(jax.vmap(lambda key: peps_jax.evaluate(result, EPISODES, key=key)))(keys)
+    single = evaluate(result, num_episodes=EPISODES, key=keys[1])
     np.testing.assert_allclose(batch.explicability[1], single.explicability, rtol=1e-4, atol=1e-4)
 
 
 def test_collected_episodes_score_as_evaluated_ones(line):
     """An episode's score is the sum over its transitions."""
-    environment, params, belief = line.task()
-    found = line_episodes(constant(0.5), params, belief, jax.random.key(0))
+    environment, params = line.env, line.params
+    found = line_episodes(constant(0.5), params, line.belief, jax.random.key(0))
     state, _ = environment.reset(jax.random.key(0), params)
     state = state.replace(place=found.perceived[0, 0])
     total = jax.tree.map(jnp.zeros_like, jax.tree.map(lambda values: values[0], found.score))
     for _ in range(int(found.length[0])):
         after = environment.step(jax.random.key(0), state, jnp.full(1, 0.5), params)
-        score = explicability.score(environment, params, belief, state, jnp.full(1, 0.5), after.state)
+        score = explicability.score(line.problem(), state, jnp.full(1, 0.5), after.state)
         total, state = jax.tree.map(jnp.add, total, score), after.state
     for field, value in zip(total._fields, total, strict=True):
         np.testing.assert_allclose(getattr(found.score, field)[0], value, rtol=1e-4, atol=1e-5, err_msg=field)

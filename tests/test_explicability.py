@@ -6,14 +6,14 @@ import numpy as np
 from conftest import LineParams, Point
 
 from peps_jax import explicability
+from peps_jax.config import Problem
 from peps_jax.explicability import Score
 
 
 def test_score_of_a_transition_by_hand(line):
-    environment, _, _ = line.task()
     params, belief = LineParams(noise=0.0, slope=1.0), LineParams(noise=0.3, slope=-2.0)
     state, after = Point(jnp.zeros(1), 0), Point(jnp.full(1, 0.17), 1)
-    score = explicability.score(environment, params, belief, state, jnp.ones(1), after)
+    score = explicability.score(Problem(line.env, params, belief), state, jnp.ones(1), after)
     off = (0.17 - 0.1) ** 2
     np.testing.assert_allclose(score.return_, 0.17, rtol=1e-5)
     np.testing.assert_allclose(score.human_return, -0.34, rtol=1e-5)
@@ -24,9 +24,8 @@ def test_score_of_a_transition_by_hand(line):
 
 
 def test_a_perfect_prediction_scores_0(line):
-    environment, params, _ = line.task()
     state, after = Point(jnp.zeros(1), 0), Point(jnp.full(1, 0.1), 1)
-    score = explicability.score(environment, params, params, state, jnp.ones(1), after)
+    score = explicability.score(Problem(line.env, line.params, line.params), state, jnp.ones(1), after)
     np.testing.assert_allclose([score.log_true, score.log_belief, score.belief_gap], 0.0, atol=1e-6)
 
 

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 import peps_envs
 from peps_envs import highway
 from peps_envs.environment import event
-from peps_envs.highway import collision, environment, simulation, traffic, vehicle
-from peps_envs.highway.vehicle import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER, Control
+from peps_envs.highway import classic, collision, environment, simulation, traffic, vehicle
+from peps_envs.highway.vehicle import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, LANE_WIDTH, SLOWER, Control
 
 RECORDINGS = {  # of highway-env 1.12.1: one behaviour at a time, and dense random traffic
     f"{name}/{scenario}": (file, scenario)
@@ -282,7 +282,10 @@ def test_observations_say_what_is_perceived(seed, plan):
     params = TASKS["rain"].params
     _, _, steps = episodes(jax.random.key(seed)[None], jnp.array(plan), params)
     expected = jax.vmap(jax.vmap(WORLD.perceive))(steps.state)
-    np.testing.assert_allclose(WORLD.perceive_observation(steps.observation, params), expected, atol=1e-3)
+    seen = np.asarray(steps.observation)
+    own, gap = seen[..., :2] * [environment.SPEED_SCALE, LANE_WIDTH], seen[..., environment.EGO_FEATURES]
+    shown = np.stack([gap * environment.GAP_SCALE - vehicle.LENGTH, own[..., 1], own[..., 0]], -1)
+    np.testing.assert_allclose(shown, expected, atol=1e-3)
 
 
 def test_meta_actions_move_targets():
@@ -503,6 +506,10 @@ def test_highway_envs_own_observation_and_reward():
     world, params = highway.ClassicHighway(), highway.make_params()
     state, observation = jax.jit(world.reset)(jax.random.key(0), params)
     assert observation.shape == (world.observation_size,)
-    np.testing.assert_allclose(world.perceive_observation(observation, params), world.perceive(state), atol=1e-3)
+    ego, ahead = np.asarray(observation).reshape(classic.ROWS, classic.COLUMNS)[:2]
+    perceived = [
+        ahead[1] * classic.SIGHT - vehicle.LENGTH, ego[2] * LANE_WIDTH * world.lanes, ego[3] * 2 * classic.MAX_SPEED
+    ]  # fmt: skip
+    np.testing.assert_allclose(perceived, world.perceive(state), atol=1e-3)
     after = jax.jit(world.step)(jax.random.key(0), state, jnp.int32(FASTER), params)
     assert after.reward == pytest.approx((0.4 * min((after.state.vehicles.speed[0] - 20) / 10, 1) + 0.1 + 1) / 1.5)

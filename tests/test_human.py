@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import Point
+from conftest import Point, settings
 
-from peps_jax.preferences import synthetic_human
-from peps_jax.trajectory import Segments
+from peps_jax.preferences import synthetic_human, teachers
+from peps_jax.preferences.data import Queries, Segments
 
 REPEATS = 4000
 
@@ -16,7 +16,7 @@ def query(first, second, mask=None):
     """A query about where the point was seen, step by step; it stood at 0 before each, and no action was taken."""
     places = jnp.asarray([[first, second]], jnp.float32)[..., None]
     before, time = jnp.zeros_like(places), jnp.zeros(places.shape[:-1], jnp.int32)
-    mask = jnp.ones(places.shape[:-1]) if mask is None else jnp.asarray([mask], jnp.float32)
+    mask = jnp.ones(places.shape[:-1], bool) if mask is None else jnp.asarray([mask], bool)
     return Segments(before, jnp.zeros_like(places), mask, Point(before, time), Point(places, time))
 
 
@@ -30,26 +30,30 @@ def weight(place, params):
 def share_of_first(config, segments, key=0):
     """How often the first segment is preferred, of many answers to one query."""
     many = jax.tree.map(lambda rows: jnp.repeat(rows, REPEATS, 0), segments)
-    return jax.jit(synthetic_human.answer)(jax.random.key(key), many, config)
+    queries = Queries(jnp.arange(REPEATS), many)
+    return jax.jit(synthetic_human.answer)(jax.random.key(key), queries, config.problem(), settings(config).human)
+
+
+def values_of(segments, config):
+    return synthetic_human.segment_values(segments, config.problem(), settings(config).human)
 
 
 def test_log_weight_is_belief_and_reward(line):
-    environment, _, belief = line.task()
     parts = synthetic_human.log_weight(
-        environment, belief, Point(jnp.zeros(1), 0), jnp.zeros(1), Point(jnp.full(1, 0.2), 1)
+        line.env, line.belief, Point(jnp.zeros(1), 0), jnp.zeros(1), Point(jnp.full(1, 0.2), 1)
     )
-    np.testing.assert_allclose(sum(parts), weight(0.2, belief), rtol=1e-5)
+    np.testing.assert_allclose(sum(parts), weight(0.2, line.belief), rtol=1e-5)
 
 
 def test_segment_values_sum_up_to_the_mask(line):
-    values = synthetic_human.segment_values(query([0.1, 0.2, 9.0], [0.3, 0.0, 0.1], [[1, 1, 0], [1, 1, 1]]), line)
+    values = values_of(query([0.1, 0.2, 9.0], [0.3, 0.0, 0.1], [[1, 1, 0], [1, 1, 1]]), line)
     expected = [sum(weight(place, line.belief) for place in places) for places in ([0.1, 0.2], [0.3, 0.0, 0.1])]
     np.testing.assert_allclose(values[0], expected, rtol=1e-5)
 
 
 def test_myopia_weighs_the_end(line):
     segments = query([0.1, 0.2, 9.0], [0.3, 0.0, 0.1], [[1, 1, 0], [1, 1, 1]])
-    values = synthetic_human.segment_values(segments, line.replace(myopia=0.5))
+    values = values_of(segments, line.replace(myopia=0.5))
     first = 0.5 * weight(0.1, line.belief) + weight(0.2, line.belief)
     second = 0.25 * weight(0.3, line.belief) + 0.5 * weight(0.0, line.belief) + weight(0.1, line.belief)
     np.testing.assert_allclose(values[0], [first, second], rtol=1e-5)
@@ -59,29 +63,29 @@ def test_myopia_weighs_the_end(line):
 def test_answers_follow_eq_2(line, rationality, mistake_rate):
     config = line.replace(rationality=rationality, mistake_rate=mistake_rate)
     segments = query([0.0, 0.1], [0.2, 0.1])
-    difference = float(np.subtract(*synthetic_human.segment_values(segments, config)[0]))
+    difference = float(np.subtract(*values_of(segments, config)[0]))
     right = 1 / (1 + np.exp(-rationality * difference))
     probability = right * (1 - mistake_rate) + (1 - right) * mistake_rate
-    preferences = share_of_first(config, segments)
-    assert set(np.unique(preferences.answers)) <= {0.0, 1.0}
+    answers = share_of_first(config, segments)
+    assert set(np.unique(answers.preferred)) <= {0.0, 1.0}
     error = 4 * np.sqrt(probability * (1 - probability) / REPEATS)
-    assert abs(float(jnp.mean(preferences.answers)) - probability) < error
-    assert bool(jnp.all(preferences.answered == 1))
+    assert abs(float(jnp.mean(answers.preferred)) - probability) < error
+    assert bool(jnp.all(answers.weight == 1))
 
 
 def test_indifference_is_a_tie(line):
     segments = query([0.0, 0.1], [0.2, 0.1])
-    difference = abs(float(np.subtract(*synthetic_human.segment_values(segments, line)[0])))
-    assert bool(jnp.all(share_of_first(line.replace(indifference=1.01 * difference), segments).answers == 0.5))
-    assert not bool(jnp.any(share_of_first(line.replace(indifference=0.99 * difference), segments).answers == 0.5))
+    difference = abs(float(np.subtract(*values_of(segments, line)[0])))
+    assert bool(jnp.all(share_of_first(line.replace(indifference=1.01 * difference), segments).preferred == 0.5))
+    assert not bool(jnp.any(share_of_first(line.replace(indifference=0.99 * difference), segments).preferred == 0.5))
 
 
 def test_skips_where_both_are_bad(line):
     segments = query([0.0, 0.1], [0.2, 0.1])
-    best = float(jnp.max(synthetic_human.segment_values(segments, line)))
-    assert bool(jnp.all(share_of_first(line.replace(skip_below=best + 0.1), segments).answered == 0))
-    assert bool(jnp.all(share_of_first(line.replace(skip_below=best - 0.1), segments).answered == 1))
+    best = float(jnp.max(values_of(segments, line)))
+    assert bool(jnp.all(share_of_first(line.replace(skip_below=best + 0.1), segments).weight == 0))
+    assert bool(jnp.all(share_of_first(line.replace(skip_below=best - 0.1), segments).weight == 1))
 
 
 def test_teacher_is_a_value():
-    assert synthetic_human.SYNTHETIC.answer is synthetic_human.answer
+    assert teachers.SYNTHETIC.answer is synthetic_human.answer

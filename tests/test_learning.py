@@ -8,14 +8,14 @@ TRAINING = """
 import json
 import jax
 from peps_jax import Config, evaluate, train
-from peps_jax.execution import batches
+from peps_jax.execution.program import stack
 
 def learned(config):
-    episodes = evaluate(train(config), config, 20)
+    episodes = evaluate(train(config), 20)
     return episodes.goal_reached, episodes.return_, episodes.explicability, episodes.perceived[0]
 
 cells = [Config(env="nav-d4", belief=belief, total_steps=20_000) for belief in ("unbiased", "biased")]
-found = jax.jit(lambda cells: jax.lax.map(learned, cells))(batches.stack(cells))
+found = jax.jit(lambda cells: jax.lax.map(learned, cells))(stack(cells))
 print(json.dumps([leaf.tolist() for leaf in found]))
 """
 

@@ -6,15 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import LineParams, Probe, ProbeParams
+from conftest import LineParams, Probe, ProbeParams, settings
 
 import peps_jax
 from peps_envs import Discrete
 from peps_jax import Config, methods
 from peps_jax.learning import policy_heads, sac
 from peps_jax.learning.policy_heads import Gaussian
-from peps_jax.methods import drlhp
-from peps_jax.train import collect_and_ask, init
+from peps_jax.round import round_at
+from peps_jax.train import collect_and_ask, init, prepare
 from peps_jax.trajectory import Transition
 
 EVERY = ("peps", "sac", "drlhp", "policy_shaping", "human_expectation")
@@ -27,7 +27,7 @@ def evaluate():
 
 
 def test_the_methods_and_their_order():
-    assert tuple(methods.METHODS) == (*EVERY, "drlhp_unscaled", "peps_absolute")
+    assert tuple(methods.METHODS) == EVERY
     text = Config.__dataclass_fields__["method"].metadata["help"]
     places = [text.index(name) for name in ("peps", " sac", "drlhp", "policy_shaping", "human_expectation")]
     assert places == sorted(places)
@@ -35,13 +35,15 @@ def test_the_methods_and_their_order():
 
 
 def test_absolute_entropies_are_more_by_those_of_what_relative_ones_are_measured_against(tiny):
-    environment, params, _ = tiny.task()
-    knowledge = methods.get("peps").init(jax.random.key(0), tiny)
-    step = Transition(jnp.zeros(environment.observation_size), jnp.zeros(2), jnp.ones(()), jnp.zeros(()), jnp.zeros(()))
-    absolute, relative = (
-        methods.get(name).rewards[0](knowledge, step, tiny.replace(lam=2.0)) for name in ("peps_absolute", "peps")
-    )
-    kernel = distrax.MultivariateNormalDiag(jnp.zeros(2), environment.perception_width(params)).entropy()
+    problem, method = tiny.problem(), methods.get("peps")
+    knowledge = method.init(jax.random.key(0), settings(tiny))
+    observation = jnp.zeros(problem.environment.observation_size)
+    step = Transition(observation, jnp.zeros(2), jnp.ones(()), observation, jnp.zeros(2), jnp.zeros((), bool))
+    reward = lambda kind: method.rewards[0](knowledge, step, settings(tiny.replace(lam=2.0, entropies=kind)))
+    absolute, relative = reward("absolute"), reward("relative")
+    kernel = distrax.MultivariateNormalDiag(
+        jnp.zeros(2), problem.environment.perception_width(problem.params)
+    ).entropy()
     uniform = distrax.Independent(distrax.Uniform(-jnp.ones(2), jnp.ones(2)), 1).entropy()
     np.testing.assert_allclose(absolute - relative, 2.0 * (kernel + tiny.policy_entropy_weight * uniform), rtol=1e-4)
 
@@ -96,18 +98,19 @@ def test_products_of_extreme_policies_are_exact(sds):
 def test_one_agent_acts_by_itself_and_two_by_their_product(line, space):
     if space == "discrete":
         line = line.replace(env=Probe(action_space=Discrete(3)), params=ProbeParams(), belief=ProbeParams())
-    parts, network, _ = sac.networks(line)
-    agents = tuple(sac.init(jax.random.key(seed), line) for seed in range(2))
+    own = settings(line).agent
+    parts, network, _ = sac.networks(own)
+    agents = tuple(sac.init(jax.random.key(seed), own) for seed in range(2))
     observations = jnp.linspace(-1.0, 1.0, 5)[:, None]
     each = [parts.policy(network.apply(agent.policy, observations)) for agent in agents]
-    chex.assert_trees_all_equal(sac.acting_policy(agents[:1], observations, line), each[0])
-    together = sac.acting_policy(agents, observations, line)
+    chex.assert_trees_all_equal(sac.acting_policy(agents[:1], observations, own), each[0])
+    together = sac.acting_policy(agents, observations, own)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
     chex.assert_trees_all_close(together, jax.vmap(parts.product, in_axes=1)(stacked), rtol=1e-5, atol=1e-6)
-    action, ratio = sac.mode(agents, observations, line)
+    action, ratio = sac.mode(agents, observations, own)
     np.testing.assert_array_equal(action, parts.mode(together)[0])
     np.testing.assert_allclose(ratio, parts.log_ratio(together, action), rtol=1e-4, atol=1e-5)
-    sampled, ratio = sac.act(agents, observations, jax.random.key(0), line)
+    sampled, ratio = sac.act(agents, observations, jax.random.key(0), own)
     np.testing.assert_allclose(ratio, parts.log_ratio(together, sampled), rtol=1e-2, atol=1e-3)
 
 
@@ -121,12 +124,12 @@ def test_every_method_learns_and_acts(line, train, evaluate, method):
     chex.assert_tree_all_finite((result.agents, result.knowledge))
     assert result.act(jnp.zeros(1)).shape == (1,)
     asks = method in ("peps", "drlhp", "policy_shaping")
-    assert hasattr(result.knowledge, "surrogate") == asks
+    assert (result.surrogate is not None) == asks
     assert ("surrogate_loss" in result.curves) == asks
     assert ("dynamics_loss" in result.curves) == (method == "peps")
     if asks:
-        assert int(result.knowledge.surrogate.answered.sum()) == line.num_queries
-    evaluation = evaluate(result, result.config, num_episodes=EPISODES)
+        assert int(result.preferences.weight.sum()) == line.num_queries
+    evaluation = evaluate(result, num_episodes=EPISODES)
     assert evaluation.explicability.shape == (EPISODES,)
     assert bool(jnp.all(jnp.isfinite(evaluation.explicability)))
 
@@ -142,7 +145,7 @@ def test_drlhp_does_not_see_the_environments_reward(line, train):
     one, two = (train(line.replace(params=LineParams(slope=slope))) for slope in (1.0, -5.0))
     chex.assert_trees_all_equal(one.agents, two.agents)
     other = train(line.replace(belief=LineParams(noise=0.1, slope=-5.0)))
-    assert not np.allclose(other.knowledge.surrogate.answers, one.knowledge.surrogate.answers)
+    assert not np.allclose(other.preferences.preferred, one.preferences.preferred)
 
 
 def test_policy_shaping_learns_one_policy_of_each_reward(line, train):
@@ -156,7 +159,7 @@ def test_policy_shaping_learns_one_policy_of_each_reward(line, train):
 
 def test_policy_shaping_acts_by_the_product(line, train):
     result = train(line.replace(method="policy_shaping"))
-    head, network, _ = sac.networks(result.config)
+    head, network, _ = sac.networks(result.training.settings.agent)
     observation = jnp.array([0.3])
     each = [head.policy(network.apply(agent.policy, observation)) for agent in result.agents]
     product = head.product(jax.tree.map(lambda *leaves: jnp.stack(leaves), *each))
@@ -165,34 +168,36 @@ def test_policy_shaping_acts_by_the_product(line, train):
 
 def test_the_product_and_each_policy_act_in_environments_of_their_own(line):
     line = line.replace(method="policy_shaping", warmup_steps=0, exploration=0.0)
-    state = init(line)
+    training = prepare(line)
+    state = init(training)
     agents = []
     for agent, push in zip(state.agents, (5.0, -5.0), strict=True):
         policy = jax.tree.map(jnp.zeros_like, agent.policy)
         policy["params"]["Dense_1"]["bias"] = jnp.array([push, -0.5])
         agents.append(agent.replace(policy=policy))
     state = state.replace(agents=tuple(agents))
-    state, _, _ = jax.jit(collect_and_ask)(state, jnp.asarray(0), line)
+    now = round_at(jnp.asarray(0), state.key, training.settings.schedule)
+    state, _, _ = jax.jit(collect_and_ask)(state, now, training)
     by_env = state.replay.action[: line.steps_per_round].reshape(-1, line.num_envs)
     assert bool(jnp.all(by_env[:, 1] > 0.9))
     assert bool(jnp.all(by_env[:, 2] < -0.9))
     assert abs(float(jnp.mean(by_env[:, [0, 3]]))) < 0.3, "the two cancel"
 
 
-def test_the_human_lives_in_the_believed_world(line, train, evaluate):
+def test_the_human_acts_in_the_believed_domain(line, train, evaluate):
     belief = LineParams(noise=0.05, slope=-2.0)
     line = line.replace(method="human_expectation", belief=belief)
     result = train(line)
     ended = np.asarray(result.curves["episodes"]) > 0
     for name in ("human_return", "explicability"):
         np.testing.assert_allclose(result.curves[name][ended], result.curves["return_"][ended], rtol=1e-5)
-    imagined = evaluate(result, line, num_episodes=EPISODES, stochastic=True)
+    imagined = evaluate(result, num_episodes=EPISODES, stochastic=True)
     np.testing.assert_allclose(imagined.belief_gap, 0.0, atol=1e-5)
     np.testing.assert_allclose(imagined.explicability, imagined.return_, rtol=1e-5)
     # what happened is the belief: its noise, and its reward
     places = imagined.perceived[..., 0]
     np.testing.assert_allclose(imagined.return_[0], -2.0 * places[0, 1 : 1 + int(imagined.length[0])].sum(), rtol=1e-4)
-    true = evaluate(result, line.replace(method="sac"), num_episodes=EPISODES)
+    true = evaluate(result, num_episodes=EPISODES, problem=line.problem())
     np.testing.assert_allclose(true.human_return, -2.0 * true.return_, rtol=1e-4)
 
 
@@ -202,10 +207,9 @@ def test_the_human_of_a_true_belief_is_sac(line, train):
     chex.assert_trees_all_close(human.agents, sac_.agents, rtol=1e-4, atol=1e-5)
 
 
-def test_drlhp_normalises_every_member(line, train):
-    result = train(line.replace(method="drlhp"))
-    state, config = result.knowledge.surrogate, result.config
-    assert drlhp.RECIPE.level == "standard"
+def test_drlhp_as_its_authors_normalised_it(line, train):
+    result = train(line.replace(method="drlhp", level="standard"))
+    state, config = result.surrogate, result.config
     assert state.shift.shape == state.scale.shape == (config.ensemble_size,)
     assert len(set(np.asarray(state.scale).tolist())) == config.ensemble_size
     assert "surrogate_validation_ratio" in result.curves

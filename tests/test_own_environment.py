@@ -47,9 +47,6 @@ class Walk(Environment):
     def perception_width(self, params):
         return jnp.full(1, params.width)
 
-    def perceive_observation(self, observation, params):
-        return observation
-
 
 def walk(**changes) -> Config:
     """Four rounds on the track, of which a human thinks that one is faster on it."""
@@ -64,7 +61,7 @@ def test_it_trains_and_is_evaluated(train):
         if jnp.issubdtype(leaf.dtype, jnp.floating):
             assert np.all(np.isfinite(leaf))
     assert np.all(np.abs(result.act(jnp.zeros(1))) <= 1)
-    evaluation = peps_jax.evaluate(result, config, 3)
+    evaluation = peps_jax.evaluate(result, 3)
     assert evaluation.perceived.shape == (3, 21, 1)
     # it knows itself: the truth is no surprise, and a belief surprises by (0.05 a / 0.1)^2 / 2 a step
     np.testing.assert_allclose(evaluation.log_true, 0.0, atol=1e-6)

@@ -17,7 +17,7 @@ from commands import contents, exit_code
 
 import peps_envs
 import peps_jax
-from peps_jax.execution import batches, compilation_cache
+from peps_jax.execution import batches, compilation_cache, program
 from peps_jax.reproduce import __main__ as reproduce
 from peps_jax.reproduce.driving import __main__ as driving
 from peps_jax.reproduce.driving import report
@@ -400,13 +400,13 @@ def member(index: int, count: int) -> list[str]:
 def test_a_sweep_of_which_every_cell_failed_says_so_by_its_exit_code(
     failing, code, line_task, tmp_path, monkeypatch, capsys
 ):
-    left, finite = [failing], batches._finite
+    left, finite = [failing], program._finite
 
     def fail(tree):
         left[0] -= 1
         return left[0] < 0 and finite(tree)
 
-    monkeypatch.setattr(batches, "_finite", fail)
+    monkeypatch.setattr(program, "_finite", fail)
     assert call(*LINE, "--out", tmp_path) == code
     printed = capsys.readouterr().out
     assert f"{failing} of 4 cells failed" in printed

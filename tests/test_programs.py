@@ -10,7 +10,7 @@ import pytest
 from conftest import Line, LineParams
 
 from peps_jax import methods
-from peps_jax.execution import batches, compilation_cache
+from peps_jax.execution import compilation_cache, program
 from peps_jax.storage import files
 
 EPISODES = 2
@@ -89,28 +89,27 @@ def test_nothing_is_kept_where_that_is_turned_off_or_impossible(tmp_path, monkey
 
 
 def test_foreign_code_has_no_name(tiny, monkeypatch):
-    assert batches._written(tiny) == batches._written(tiny.replace(seed=1, lam=3.0))
-    assert batches._written(tiny) != batches._written(tiny.replace(batch_size=17))
-    assert batches._written(tiny.replace(env=Line(), params=LineParams(), belief=LineParams())) is None
-    mine = methods.get("sac")._replace(name="mine", init=lambda key, config: ())
+    assert program.written(tiny) == program.written(tiny.replace(seed=1, lam=3.0))
+    assert program.written(tiny) != program.written(tiny.replace(batch_size=17))
+    assert program.written(tiny.replace(env=Line(), params=LineParams(), belief=LineParams())) is None
+    mine = methods.get("sac")._replace(name="mine", init=lambda key, settings: ())
     monkeypatch.setitem(methods.METHODS, "mine", mine)
-    assert batches._written(tiny.replace(method="mine")) is None
+    assert program.written(tiny.replace(method="mine")) is None
 
 
 PROGRAM = """
 import sys
 import numpy as np
 from peps_jax import Config
-from peps_jax.execution import batches
-from peps_jax.execution import compilation_cache
+from peps_jax.execution import batches, program
 sizes = dict(total_steps=40, num_envs=4, rollout_length=10, warmup_steps=0, batch_size=8, hidden_sizes=(4,), updates_per_step=0.1)
 cells = [Config(method="sac", seed=seed, **sizes) for seed in range(2)]
 (planned,) = batches.plan(cells, 2)
 if sys.argv[1] == "known":
-    batches.Program._compile = None
-program, _ = batches.program(cells[0], planned, 2)
-finished, _ = program.run(cells)
-print([one.evaluation.return_.tolist() for one in finished], program.bytes_used)
+    program.Program._compile = None
+compiled, _ = program.program(cells[0], planned.slots, 2, planned.devices)
+finished, _ = compiled.run(cells)
+print([one.evaluation.return_.tolist() for one in finished], compiled.bytes_used)
 """
 
 

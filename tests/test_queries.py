@@ -2,12 +2,13 @@
 
 import math
 
+import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import Point
-from hypothesis import given, settings
+from conftest import Point, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -17,7 +18,7 @@ from peps_jax.trajectory import Trajectory, Transition
 logits = hnp.arrays(np.float32, (4, 6), elements=st.floats(-30, 30, width=32))
 
 
-@settings(max_examples=30, deadline=None)
+@hypothesis.settings(max_examples=30, deadline=None)
 @given(logits)
 def test_information_gain_is_between_0_and_log_2(logits):
     gain = queries.information_gain(jnp.asarray(logits))
@@ -46,27 +47,27 @@ def test_certain_members_that_contradict_tell_log_2():
 
 @pytest.mark.parametrize("strategy", ["information_gain", "disagreement", "random"])
 def test_a_chosen_batch_has_no_repeats(line, strategy):
-    config = line.replace(query_strategy=strategy)
+    config = settings(line.replace(query_strategy=strategy)).queries
     key_logits, key_places, key = jax.random.split(jax.random.key(0), 3)
-    distinct = 2 * config.queries_per_round
+    distinct = 2 * config.per_round
     places = jnp.tile(jax.random.normal(key_places, (distinct, 3)), (3, 1))  # each three times
     scores = jnp.tile(3 * jax.random.normal(key_logits, (4, distinct)), (1, 3))
     chosen = queries.choose(scores, places, key, config)
-    assert chosen.shape == (config.queries_per_round,)
-    assert len(set(np.asarray(chosen).tolist())) == config.queries_per_round
-    assert len(set((np.asarray(chosen) % distinct).tolist())) == config.queries_per_round, "a near-duplicate was taken"
+    assert chosen.shape == (config.per_round,)
+    assert len(set(np.asarray(chosen).tolist())) == config.per_round
+    assert len(set((np.asarray(chosen) % distinct).tolist())) == config.per_round, "a near-duplicate was taken"
 
 
 def test_the_most_informative_comes_first(line):
     scores = jnp.array([[0.0, 5.0, 0.1, 1.0, 2.0, 0.2, 0.3], [0.0, -5.0, 0.1, -1.0, 2.0, 0.2, 0.3]])
-    chosen = queries.choose(scores, jnp.arange(7.0)[:, None], jax.random.key(0), line)
+    chosen = queries.choose(scores, jnp.arange(7.0)[:, None], jax.random.key(0), settings(line).queries)
     assert chosen[0] == 1
     assert chosen[1] == 3
 
 
 def test_no_candidate_is_taken_twice_while_others_are_left(line):
     """Two kinds of candidates, 640 in all: duplicates come last, but each is a pair of its own."""
-    config = line.replace(num_queries=64 * line.num_rounds)
+    config = settings(line.replace(num_queries=64 * line.num_rounds)).queries
     kinds = jnp.arange(640) % 2
     logits = jnp.stack([3.0 * kinds, -3.0 * kinds])
     chosen = np.asarray(queries.choose(logits, kinds[:, None].astype(jnp.float32), jax.random.key(0), config))
@@ -77,7 +78,7 @@ def test_no_candidate_is_taken_twice_while_others_are_left(line):
 
 @pytest.mark.parametrize("strategy", ["information_gain", "disagreement"])
 def test_ties_are_broken_at_random(line, strategy):
-    config = line.replace(query_strategy=strategy)
+    config = settings(line.replace(query_strategy=strategy)).queries
     first = lambda seed: int(
         queries.choose(jnp.zeros((3, 50)), jnp.arange(50.0)[:, None], jax.random.key(seed), config)[0]
     )
@@ -90,30 +91,32 @@ def collected(steps=10, num_envs=3, ends=()):
     over = jnp.zeros((steps, num_envs), bool)
     for step, env, kind in ends:
         over = over.at[step, env].set(kind == "truncated")
-    terminated = jnp.zeros((steps, num_envs))
+    terminated = jnp.zeros((steps, num_envs), bool)
     for step, env, kind in ends:
-        terminated = terminated.at[step, env].set(float(kind == "terminated"))
+        terminated = terminated.at[step, env].set(kind == "terminated")
     place = place[..., None]
     point = Point(place, jnp.zeros((steps, num_envs), jnp.int32))
-    transition = Transition(place, jnp.zeros_like(place), jnp.zeros((steps, num_envs)), place + 1, terminated)
+    transition = Transition(
+        place, jnp.zeros_like(place), jnp.zeros((steps, num_envs)), place + 1, jnp.ones_like(place), terminated
+    )
     return Trajectory(transition, over, jnp.zeros((steps, num_envs, 1), bool), point, point)
 
 
 def test_candidates_are_pieces_of_one_environment(line):
-    config = line.replace(num_queries=400, min_segment_length=2)
+    config = settings(line.replace(num_queries=400, min_segment_length=2)).queries
     pairs = jax.jit(queries.candidates)(collected(), jax.random.key(0), config)
-    number = config.queries_per_round * config.candidates_per_query
+    number = config.per_round * config.candidates_per_query
     assert pairs.mask.shape == (number, 2, config.segment_length)
     np.testing.assert_array_equal(jnp.diff(pairs.observation[..., 0], axis=-1), 1)
     lengths = np.asarray(jnp.sum(pairs.mask, -1))
     assert set(np.unique(lengths)) == {2, 3, 4, 5}
-    assert bool(jnp.all(jnp.diff(pairs.mask, axis=-1) <= 0)), "a mask that has ended doesn't start again"
+    assert bool(jnp.all(jnp.diff(pairs.mask.astype(int), axis=-1) <= 0)), "a mask that has ended doesn't start again"
     assert set(np.unique(pairs.observation[:, :, 0] // 100)) == {0, 1, 2}
 
 
 @pytest.mark.parametrize("kind", ["terminated", "truncated"])
 def test_a_candidate_ends_with_its_episode(line, kind):
-    config = line.replace(num_queries=400, min_segment_length=5)
+    config = settings(line.replace(num_queries=400, min_segment_length=5)).queries
     pairs = jax.jit(queries.candidates)(
         collected(ends=[(4, 0, kind), (4, 1, kind), (4, 2, kind)]), jax.random.key(0), config
     )
@@ -123,6 +126,6 @@ def test_a_candidate_ends_with_its_episode(line, kind):
 
 
 def test_describe_ignores_what_is_masked(line):
-    pairs = queries.candidates(collected(), jax.random.key(0), line.replace(min_segment_length=1))
-    hidden = pairs._replace(observation=jnp.where(pairs.mask[..., None] > 0, pairs.observation, 1e6))
+    pairs = queries.candidates(collected(), jax.random.key(0), settings(line.replace(min_segment_length=1)).queries)
+    hidden = pairs._replace(observation=jnp.where(pairs.mask[..., None], pairs.observation, 1e6))
     np.testing.assert_array_equal(queries.describe(pairs), queries.describe(hidden))

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from peps_jax import Config, evaluate, train
-from peps_jax.execution import batches
+from peps_jax.execution.program import shared
 from peps_jax.sweep import command
 
 NUMBERS, TABLE = (Path(__file__).parent / "recorded" / name for name in ("numbers.npz", "table.csv"))
@@ -32,7 +32,7 @@ SETTINGS = dict(
     seed=3, lam=1.7, total_steps=120, num_envs=4, rollout_length=10, warmup_steps=40, exploration=0.2, hold_steps=3,
     learning_rate=1e-3, fade_share=0.3, temperature=0.02, initial_temperature=3.0, anneal_share=0.8,
     saturation_penalty=0.02, target_rate=0.01, reward_scale=0.1, updates_per_step=0.1, batch_size=16, hidden_sizes=(8,),
-    ensemble_size=3, model_hidden_sizes=(8,), dynamics_learning_rate=1e-3, dynamics_updates=3,
+    ensemble_size=3, model_hidden_sizes=(8,), dynamics_learning_rate=1e-3, dynamics_updates=3, dynamics_batch_size=16,
     surrogate_learning_rate=5e-3, surrogate_updates=3, surrogate_batch_size=8, surrogate_decay=1e-4, num_queries=18,
     segment_length=5, min_segment_length=2, query_strategy="information_gain", candidates_per_query=10, gamma=0.995,
     policy_entropy_weight=0.3, mistake_rate=0.1, myopia=0.95,
@@ -40,7 +40,7 @@ SETTINGS = dict(
 SWEEP = """
     --env nav-d1 --method peps sac --lam 0.5 2.0 --seeds 2 --seed 3 --total-steps 120 --num-envs 4 --rollout-length 10
     --warmup-steps 40 --updates-per-step 0.1 --batch-size 16 --hidden-sizes 8 --ensemble-size 3 --model-hidden-sizes 8
-    --dynamics-updates 3 --surrogate-updates 3 --surrogate-batch-size 8 --num-queries 18 --episodes 4
+    --dynamics-updates 3 --dynamics-batch-size 16 --surrogate-updates 3 --surrogate-batch-size 8 --num-queries 18 --episodes 4
 """
 EPISODES = 3
 
@@ -61,7 +61,7 @@ def learned(result) -> dict[str, jax.Array]:
 def figures(config: Config) -> dict[str, jax.Array]:
     """What a training has learned, its curves, and its evaluation."""
     result = train(config)
-    evaluation = evaluate(result, config, EPISODES, stochastic=True)
+    evaluation = evaluate(result, EPISODES, stochastic=True)
     scored = dict(zip(evaluation.score._fields, evaluation.score, strict=True))
     scored |= {"log_policy": evaluation.log_policy, "length": evaluation.length}
     named = {"learned": learned(result), "curve": result.curves, "evaluation": scored}
@@ -70,7 +70,8 @@ def figures(config: Config) -> dict[str, jax.Array]:
 
 def training(environment: str, method: str) -> dict[str, np.ndarray]:
     """One training's figures. Environments that share code share a program."""
-    config = batches.shared(Config(env=environment, method=method, **SETTINGS))
+    level = "standard" if method == "drlhp" else "none"
+    config = shared(Config(env=environment, method=method, level=level, **SETTINGS))
     return jax.tree.map(np.asarray, _figures(config))
 
 

@@ -53,13 +53,13 @@ def test_a_taken_name_is_refused(registered):
 
 def test_a_task_of_ones_own_is_found(registered):
     assert peps_envs.names()[-1] == "track"
-    environment, params, belief = Config(env="track").task()
-    assert (environment, params.pace, belief.pace) == (Walk(), 0.2, 0.3)
-    assert Config(env="track", belief="true").task()[2].pace == 0.2
-    assert Config(env="track", belief=Track(pace=0.7)).task()[2].pace == 0.7
+    problem = Config(env="track").problem()
+    assert (problem.environment, problem.params.pace, problem.belief.pace) == (Walk(), 0.2, 0.3)
+    assert Config(env="track", belief="true").problem().belief.pace == 0.2
+    assert Config(env="track", belief=Track(pace=0.7)).problem().belief.pace == 0.7
 
 
 def test_an_environment_object_needs_its_parameters():
     with pytest.raises(ValueError, match=r"^params is None: give it when env is an Environment object$"):
-        Config(env=Walk()).task()
-    assert Config(env=Walk(), params=Track(0.2), belief=Track(0.3)).task()[1] == Track(0.2)
+        Config(env=Walk()).problem()
+    assert Config(env=Walk(), params=Track(0.2), belief=Track(0.3)).problem().params == Track(0.2)

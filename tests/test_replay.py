@@ -3,9 +3,8 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from conftest import Line, Probe
 
-from peps_envs import Discrete
+from peps_envs import Box, Discrete
 from peps_jax.learning import replay
 from peps_jax.trajectory import Transition
 
@@ -13,11 +12,11 @@ from peps_jax.trajectory import Transition
 def numbered(start, number):
     """Transitions that say in every field which they are."""
     index = jnp.arange(start, start + number, dtype=jnp.float32)
-    return Transition(index[:, None], index[:, None], index, index[:, None], index)
+    return Transition(index[:, None], index[:, None], index, index[:, None], index[:, None], index % 2 == 1)
 
 
 def test_add_writes_at_its_position_and_nowhere_else():
-    buffer = replay.init(10, Line())
+    buffer = replay.init(10, 1, Box(1), 1)
     buffer = replay.add(buffer, numbered(1, 4), 0)
     buffer = replay.add(buffer, numbered(5, 4), jnp.asarray(4))
     np.testing.assert_array_equal(buffer.reward, [1, 2, 3, 4, 5, 6, 7, 8, 0, 0])
@@ -25,17 +24,18 @@ def test_add_writes_at_its_position_and_nowhere_else():
 
 
 def test_sample_draws_whole_transitions_uniformly_from_the_filled_rows():
-    buffer = replay.add(replay.init(10, Line()), numbered(0, 10), 0)
+    buffer = replay.add(replay.init(10, 1, Box(1), 1), numbered(0, 10), 0)
     batch = replay.sample(buffer, jax.random.key(0), (20, 100), 5)
     assert batch.observation.shape == (20, 100, 1)
-    for rows in (batch.observation[..., 0], batch.action[..., 0], batch.next_observation[..., 0], batch.terminated):
-        np.testing.assert_array_equal(rows, batch.reward)
+    for rows in (batch.observation, batch.action, batch.next_observation, batch.movement):
+        np.testing.assert_array_equal(rows[..., 0], batch.reward)
+    np.testing.assert_array_equal(batch.terminated, batch.reward % 2 == 1)
     share = np.bincount(np.asarray(batch.reward, int).ravel(), minlength=10) / 2000
     np.testing.assert_allclose(share[:5], 0.2, atol=0.05)
     np.testing.assert_array_equal(share[5:], 0)
 
 
 def test_discrete_actions_are_whole_numbers():
-    buffer = replay.init(3, Probe(action_space=Discrete(4)))
+    buffer = replay.init(3, 1, Discrete(4), 1)
     assert buffer.action.shape == (3,)
     assert jnp.issubdtype(buffer.action.dtype, jnp.integer)

@@ -12,7 +12,7 @@ from commands import exit_code, is_one_complaint
 from peps_jax import Config
 from peps_jax.analysis.intervals import Estimate
 from peps_jax.drawing import panels
-from peps_jax.execution import batches
+from peps_jax.execution import batches, program
 from peps_jax.reproduce import __main__ as command
 from peps_jax.reproduce import figures, store, tables, trainings
 from peps_jax.reproduce.driving import experiment, figure3
@@ -34,7 +34,7 @@ def no_training(monkeypatch):
     def refuse(*arguments, **settings):
         raise AssertionError("compiled")
 
-    monkeypatch.setattr(batches, "Program", refuse)
+    monkeypatch.setattr(program, "Program", refuse)
     monkeypatch.setattr(trainings, "_plan_and_walk", refuse)
 
 

@@ -17,10 +17,9 @@ import pytest
 from commands import contents, exit_code
 
 import peps_envs
-from peps_jax.execution import batches, checkpoints, compilation_cache
+from peps_jax.execution import batches, checkpoints, compilation_cache, program
 from peps_jax.storage import files
 from peps_jax.sweep import command, journal, pictures, results, underway
-from peps_jax.train import init
 
 # a real death takes the threads of Orbax with it; here they come back to a loop that is no more
 pytestmark = pytest.mark.filterwarnings("ignore:(?s).*Event loop is closed:pytest.PytestUnraisableExceptionWarning")
@@ -168,7 +167,7 @@ def test_killed_at_the_very_end(whole, tmp_path, monkeypatch, capsys):
 def test_killed_anywhere_and_continued(whole, tmp_path, monkeypatch):
     """The same command again and again, as a script would give it, until the sweep is complete; and so on."""
     chance, kills, trainings = random.Random(0), 0, 0
-    advanced, run = underway.Keeper.advanced, batches.Program.run
+    advanced, run = underway.Keeper.advanced, program.Program.run
 
     def hear(self, *arguments):
         DEATH.tick()
@@ -181,7 +180,7 @@ def test_killed_anywhere_and_continued(whole, tmp_path, monkeypatch):
         return run(self, cells, *arguments)
 
     monkeypatch.setattr(underway.Keeper, "advanced", hear)
-    monkeypatch.setattr(batches.Program, "run", run_unfinished)
+    monkeypatch.setattr(program.Program, "run", run_unfinished)
     while kills < KILLS:
         folder = tmp_path / str(trainings)
         trainings += 1
@@ -262,7 +261,7 @@ def damage(path: Path, chance: random.Random) -> None:
 
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(stopped, tmp_path, line, capsys):
     cells = [line.replace(method="sac", seed=seed) for seed in (2, 3)]
-    empty = batches.empty_progress(cells[0], 2)
+    empty = program.empty_progress(cells[0], 2)
     about = json.loads(files.unseal(next(stopped.glob("progress/*/rounds-*3/checkpoint.json")).read_bytes()))
     about = {name: about[name] for name in ("peps-jax", "jax", "jaxlib", "devices", "configuration", "cells")}
     source = stopped / "progress" / "batch-00001"
@@ -304,12 +303,12 @@ def test_a_sweep_with_damaged_files_is_continued(pattern, said, stopped, whole, 
 
 def test_a_state_is_restored_as_it_was(line, tmp_path):
     config = line.replace(method="peps", seed=3)
-    state = jax.jit(jax.vmap(init))(batches.stack([config, config.replace(seed=4)]))
-    progress = batches.Progress(
-        7, batches._on_host(state, 2), {"return_": np.array([[1.0, np.nan]] * 2, np.float32)}, 1.25
+    state = jax.jit(jax.vmap(program.begin))(program.stack([config, config.replace(seed=4)]))
+    progress = program.Progress(
+        7, program._on_host(state, 2), {"return_": np.array([[1.0, np.nan]] * 2, np.float32)}, 1.25
     )
     kept = checkpoints.Checkpoints(tmp_path / "deep" / "folder", {"of": "this"})
-    empty = batches.empty_progress(config, 2)
+    empty = program.empty_progress(config, 2)
     assert kept.latest(empty) is None
     kept.save(progress)
     restored = kept.latest(empty)
@@ -318,7 +317,7 @@ def test_a_state_is_restored_as_it_was(line, tmp_path):
     with pytest.raises(checkpoints.IncompatibleError, match="has of this, not that"):
         checkpoints.Checkpoints(tmp_path / "deep" / "folder", {"of": "that"}).latest(empty)
     with pytest.raises(checkpoints.IncompatibleError, match="doesn't have"):
-        kept.latest(batches.empty_progress(line.replace(method="sac"), 2))
+        kept.latest(program.empty_progress(line.replace(method="sac"), 2))
 
 
 def test_checkpoints_by_the_clock_take_a_small_share_of_it(monkeypatch):
@@ -449,10 +448,10 @@ def test_a_full_disk_is_told_from_what_orbax_raises(line, tmp_path, monkeypatch)
         def __init__(self, *arguments):
             raise ValueError("RESOURCE_EXHAUSTED: Error writing 'x': No space left on device [source locations]")
 
-    state = batches._on_host(jax.jit(jax.vmap(init))(batches.stack([line.replace(method="sac")])), 1)
+    state = program._on_host(jax.jit(jax.vmap(program.begin))(program.stack([line.replace(method="sac")])), 1)
     monkeypatch.setattr(checkpoints._orbax(), "Checkpointer", Full)
     with pytest.raises(files.NotWrittenError, match="can't be written: No space left on device"):
-        checkpoints.Checkpoints(tmp_path / "new", {}).save(batches.Progress(1, state, {}, 0.0))
+        checkpoints.Checkpoints(tmp_path / "new", {}).save(program.Progress(1, state, {}, 0.0))
     assert not list((tmp_path / "new").iterdir())
 
 

@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import Probe, ProbeParams
+from conftest import Probe, ProbeParams, settings
 
-from peps_envs import Discrete
+from peps_envs import Box, Discrete
+from peps_jax import rollout
 from peps_jax.learning import policy_heads, sac
 from peps_jax.learning.policy_heads import Gaussian
 from peps_jax.trajectory import Transition
@@ -85,10 +86,11 @@ def test_discrete_log_ratio_is_0_for_the_uniform_policy():
     assert int(head.mode(certain)[0]) == 0
 
 
-@pytest.mark.parametrize("head", [policy_heads.continuous_head(1, 2), policy_heads.discrete_head(1, 3)])
-def test_uniform_actions_lie_in_the_action_space(head):
-    actions = np.asarray(jax.vmap(head.uniform)(jax.random.split(jax.random.key(0), 300)))
-    if head.critic_size == 1:
+@pytest.mark.parametrize("space", [Box(2), Discrete(3)])
+def test_random_actions_lie_in_the_action_space(space):
+    draw = jax.vmap(lambda key: rollout.random_action(space, key))
+    actions = np.asarray(draw(jax.random.split(jax.random.key(0), 300)))
+    if isinstance(space, Box):
         assert actions.min() >= -1
         assert actions.max() <= 1
         np.testing.assert_allclose(actions.mean(0), 0.0, atol=0.15)
@@ -101,7 +103,7 @@ def discrete(line, size=3):
 
 
 def test_discrete_expectations_are_exact(line):
-    config = discrete(line)
+    config = settings(discrete(line)).agent
     head, _, critic_network = sac.networks(config)
     agent = sac.init(jax.random.key(0), config)
     observation, outputs = jnp.array([0.3]), jnp.array([0.2, -1.0, 0.7])
@@ -116,12 +118,13 @@ def test_discrete_expectations_are_exact(line):
 def two_transitions():
     """The same step twice: once the MDP ended with it, once only its time was up."""
     return Transition(
-        jnp.zeros((2, 1)), jnp.full((2, 1), 0.5), jnp.array([3.0, 3.0]), jnp.full((2, 1), 0.2), jnp.array([1.0, 0.0])
-    )
+        observation=jnp.zeros((2, 1)), action=jnp.full((2, 1), 0.5), reward=jnp.array([3.0, 3.0]),
+        next_observation=jnp.full((2, 1), 0.2), movement=jnp.full((2, 1), 2.0), terminated=jnp.array([True, False]),
+    )  # fmt: skip
 
 
 def test_critic_targets_by_hand(line):
-    config = line.replace(gamma=0.9)
+    config = settings(line.replace(gamma=0.9)).agent
     agent = sac.init(jax.random.key(0), config)
     # targets that always say 7 and 5: the smaller counts
     targets = jax.tree.map(jnp.zeros_like, agent.targets)
@@ -135,15 +138,16 @@ def test_critic_targets_by_hand(line):
 
 
 def test_critic_loss_by_hand(line):
-    agent = sac.init(jax.random.key(0), line)
+    config = settings(line).agent
+    agent = sac.init(jax.random.key(0), config)
     critics = jax.tree.map(jnp.zeros_like, agent.critics)
     critics["params"]["Dense_1"]["bias"] = jnp.array([[1.0], [2.0]])
-    loss = sac.critic_loss(critics, jnp.array([0.0, 4.0]), two_transitions(), line)
+    loss = sac.critic_loss(critics, jnp.array([0.0, 4.0]), two_transitions(), config)
     np.testing.assert_allclose(loss, 0.5 * ((1 + 9) / 2 + (4 + 4) / 2), rtol=1e-6)
 
 
 def test_policy_loss_by_hand(line):
-    config = discrete(line)
+    config = settings(discrete(line)).agent
     agent = sac.init(jax.random.key(0), config)
     critics = jax.tree.map(jnp.zeros_like, agent.critics)
     critics["params"]["Dense_1"]["bias"] = jnp.array([[1.0, 2.0, 3.0], [3.0, 2.0, 1.0]])
@@ -156,7 +160,7 @@ def test_policy_loss_by_hand(line):
 
 
 def test_targets_follow_slowly(line):
-    config = line.replace(target_rate=0.1)
+    config = settings(line.replace(target_rate=0.1)).agent
     agent = sac.init(jax.random.key(0), config)
     after, _ = jax.jit(sac.update)(
         agent, two_transitions(), 0.3, sac.draw_noise(jax.random.key(1), (2,), config), config
@@ -168,14 +172,14 @@ def test_targets_follow_slowly(line):
 
 @pytest.mark.parametrize("excess", [-0.5, 0.5])
 def test_temperature_rises_where_the_entropy_is_too_low(line, excess):
-    agent = sac.init(jax.random.key(0), line)
-    environment, _, _ = line.task()
-    tuned = sac._tune(agent, jnp.asarray(sac.target_entropy(environment) + excess), line)
+    config = settings(line).agent
+    agent = sac.init(jax.random.key(0), config)
+    tuned = sac._tune(agent, jnp.asarray(sac.target_entropy(config.action_space) + excess), config)
     assert float(tuned.log_temperature - agent.log_temperature) * excess < 0
 
 
 def test_tuned_temperature_is_used(line):
-    config = line.replace(tune_temperature=True, temperature=0.3, reward_scale=0.5)
+    config = settings(line.replace(tune_temperature=True, temperature=0.3, reward_scale=0.5)).agent
     agent = sac.init(jax.random.key(0), config)
     noise = sac.draw_noise(jax.random.key(1), (2,), config)
     after, info = jax.jit(sac.update)(agent, two_transitions(), 99.0, noise, config)
@@ -200,7 +204,7 @@ def probe(line, environment, temperature=0.0, **params):
 
 def values(result, observation, action):
     """Both critics' Q, for rows of observations and actions."""
-    head, _, network = sac.networks(result.config)
+    head, _, network = sac.networks(result.training.settings.agent)
     return head.critics(network, result.agents[0].critics, jnp.asarray(observation), jnp.asarray(action))
 
 
@@ -234,7 +238,7 @@ def test_probe_discrete_actions_and_the_soft_policy(line, train):
     result = train(probe(line, environment, temperature=temperature, last=0.0, choice=gap))
     quality = np.array([0.0, 0.5, 1.0]) * gap
     np.testing.assert_allclose(values(result, jnp.zeros((3, 1)), jnp.arange(3)), [quality] * 2, atol=0.1)
-    _, network, _ = sac.networks(result.config)
+    _, network, _ = sac.networks(result.training.settings.agent)
     probabilities = jax.nn.softmax(network.apply(result.agents[0].policy, jnp.zeros(1)))
     expected = np.exp(quality / temperature) / np.exp(quality / temperature).sum()  # pi ~ exp(Q / alpha)
     np.testing.assert_allclose(probabilities, expected, atol=0.06)

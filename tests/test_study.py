@@ -12,9 +12,11 @@ from commands import exit_code, is_one_complaint
 from peps_envs.highway.vehicle import FASTER, IDLE, LANE_LEFT, SLOWER
 from peps_envs.scene import Rectangle
 from peps_jax.drawing import scenes as pictures
+from peps_jax.preferences import data, teachers
 from peps_jax.reproduce.driving import __main__ as command
 from peps_jax.reproduce.driving import comparisons, experiment, participants, ratings, report
 from peps_jax.reproduce.driving import scenes as road_scenes
+from peps_jax.train import train
 
 PLANS = {
     "steer": [LANE_LEFT, FASTER, *[IDLE] * 6],
@@ -28,7 +30,7 @@ PLANS = {
 def follow(plan, key):
     """Four scenes in the rain that follow `plan` (8,)."""
     return road_scenes.watch(
-        lambda observation, key, time: jnp.repeat(plan[time], 4), road_scenes.road("highway-rain"), key, 4
+        lambda observation, key, time: jnp.repeat(plan[time], 4), road_scenes.road("highway-rain").problem(), key, 4
     )
 
 
@@ -56,8 +58,7 @@ def test_participants_scatter_around_the_papers_means():
 
 
 def test_a_mind_lies_between_the_true_road_and_a_dry_one():
-    _, rain, _ = road_scenes.road("highway-rain").task()
-    _, dry, _ = road_scenes.road("highway-dry").task()
+    rain, dry = (road_scenes.road(f"highway-{name}").problem().params for name in ("rain", "dry"))
     person = jax.tree.map(lambda leaf: leaf[0], participants.recruit(jax.random.key(0), 1))
     for share, expected in ((0.0, rain), (1.0, dry)):
         believed = participants.mind(person.replace(dry_share=jnp.asarray(share)), rain).physics.friction
@@ -74,23 +75,24 @@ def test_the_sanity_check_removes_who_answers_at_random():
 
 
 def test_nobody_is_shown_a_collision_but_in_the_sanity_check(given):
-    assert given.answers.shape == (comparisons.TRAINERS * comparisons.ANSWERS,)
-    assert not np.any(road_scenes.crashed(given.segments))
-    assert set(np.unique(given.answers)) <= {0.0, 1.0}
-    silent = np.sum(np.asarray(given.answered) == 0)
-    assert silent % comparisons.ANSWERS == 0, "all of a participant's answers count, or none"
-    assert silent < len(given.answered) / 2
+    pairs, answers = given
+    assert answers.preferred.shape == (comparisons.TRAINERS * comparisons.ANSWERS,)
+    assert not np.any(road_scenes.crashed(pairs))
+    assert set(np.unique(answers.preferred)) <= {0.0, 1.0}
+    silent = np.asarray(answers.weight).reshape(comparisons.TRAINERS, -1) == 0
+    assert np.all(silent.all(1) | ~silent.any(1)), "all of a participant's answers count, or none"
+    assert silent.mean() < 0.5
 
 
 def test_both_pieces_of_a_pair_begin_alike(given):
-    begun = jax.tree.map(lambda rows: np.asarray(rows[:, :, 0]), given.segments.state)
+    begun = jax.tree.map(lambda rows: np.asarray(rows[:, :, 0]), given[0].state)
     first, second = jax.tree.map(lambda rows: rows[:, 0], begun), jax.tree.map(lambda rows: rows[:, 1], begun)
     np.testing.assert_array_equal(first.time, second.time)
     fresh = first.time == 0
     assert fresh.mean() > comparisons.FROM_START
     for one, other in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
         np.testing.assert_array_equal(one[fresh], other[fresh])
-    lengths = np.asarray(given.segments.mask).sum(-1)
+    lengths = np.asarray(given[0].mask).sum(-1)
     assert lengths.min() >= 1
     assert 0.3 < np.mean(lengths[:, 0] == lengths[:, 1]) < 0.8, "both kinds of pairs"
 
@@ -114,9 +116,9 @@ def test_behaviours_are_told_apart_by_what_is_seen(scenes):
 
 
 def test_a_human_on_a_dry_road_likes_braking_best_and_swerving_late_more_than_at_once():
-    human = road_scenes.road("highway-dry")
+    human = road_scenes.road("highway-dry").problem()
     person = jax.tree.map(lambda leaf: leaf[0], participants.recruit(jax.random.key(0), 1))
-    want = human.task()[2]
+    want = human.belief
     person = person.replace(
         ratings=want.ratings, lane_change_cost=want.lane_change_cost, swerve_cost=want.swerve_cost,
         dry_share=jnp.ones(()),
@@ -133,10 +135,10 @@ def test_a_human_on_a_dry_road_likes_braking_best_and_swerving_late_more_than_at
 
 
 def test_ratings_follow_the_participants_own_worth(scenes):
-    config = road_scenes.road("highway-rain")
+    problem = road_scenes.road("highway-rain").problem()
     shown = jax.tree.map(lambda *rows: jnp.concatenate([row[:1] for row in rows]), *scenes.values())
     people = participants.recruit(jax.random.key(4), 200)
-    given = np.asarray(jax.jit(lambda: ratings.rate(jax.random.key(5), people, shown, config))())
+    given = np.asarray(jax.jit(lambda: ratings.rate(jax.random.key(5), people, shown, problem))())
     assert given.shape == (200, 4)
     assert set(np.unique(given)) <= set(range(1, 11))
     crash = list(PLANS).index("idle")
@@ -157,7 +159,7 @@ def test_analysis_of_variance_by_hand():
 
 def test_groups_of_raters(scenes):
     named = {"peps": scenes["brake, steer"], "sac": scenes["steer"], "drlhp": scenes["idle"]}
-    found = ratings.groups(jax.random.key(0), named, road_scenes.road("highway-rain"), number=3)
+    found = ratings.groups(jax.random.key(0), named, road_scenes.road("highway-rain").problem(), number=3)
     assert len(found) == 3
     assert all(min(group.mean, key=group.mean.get) == "drlhp" for group in found)
     findings = experiment.Findings(named, {}, {}, found, [])
@@ -166,7 +168,7 @@ def test_groups_of_raters(scenes):
         [max(group.mean, key=group.mean.get) == "peps" for group in found]
     )
     renamed = ratings.groups(
-        jax.random.key(0), dict(zip("abc", named.values(), strict=True)), road_scenes.road("highway-rain"), 3
+        jax.random.key(0), dict(zip("abc", named.values(), strict=True)), road_scenes.road("highway-rain").problem(), 3
     )
     assert [list(group.mean.values()) for group in renamed] == [list(group.mean.values()) for group in found]
 
@@ -250,7 +252,6 @@ def test_another_study_is_never_replaced_unasked(tmp_path, capsys, monkeypatch):
 def test_a_small_study_from_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(comparisons, "ANSWERS", 2)
     small = dict(num_envs=4, rollout_length=10, warmup_steps=40, batch_size=16, hidden_sizes=(8,))
-    small |= dict(num_queries=comparisons.TRAINERS * comparisons.ANSWERS)
     monkeypatch.setattr(experiment, "SETTINGS", experiment.SETTINGS | small)
     monkeypatch.setattr(experiment, "EPISODES", 8)
     monkeypatch.setattr(experiment, "METHODS", ("peps", "sac"))
@@ -265,10 +266,13 @@ def test_a_small_study_from_end_to_end(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_an_agent_is_taught_all_answers(given):
-    answers = jax.tree.map(lambda rows: rows[:21], given)
-    small = dict(num_envs=4, rollout_length=10, warmup_steps=40, batch_size=16, hidden_sizes=(8,), num_queries=21)
+    """By the recorded teacher: nothing else is asked, and all that was said counts from the first round on."""
+    pairs, answers = jax.tree.map(lambda rows: rows[:21], given)
+    small = dict(num_envs=4, rollout_length=10, warmup_steps=40, batch_size=16, hidden_sizes=(8,))
     config = experiment.settings("drlhp", 0, 80, **small)
-    taught = jax.jit(experiment.taught)(config, answers).knowledge.surrogate
-    np.testing.assert_array_equal(taught.answers[:21], answers.answers)
-    np.testing.assert_array_equal(taught.mask[:21], answers.segments.mask)
-    assert taught.weights[21:].sum() == 0, "what fills up the last round doesn't count"
+    teach = lambda config, pairs, answers: train(config, teachers.recorded(data.recording(pairs, answers)))
+    learned = jax.jit(teach)(config, pairs, answers).preferences
+    np.testing.assert_array_equal(learned.preferred, jnp.where(answers.weight > 0, answers.preferred, 0.0))
+    np.testing.assert_array_equal(learned.weight, answers.weight)
+    np.testing.assert_array_equal(learned.mask, pairs.mask)
+    assert not np.any(learned.since)

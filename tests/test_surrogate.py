@@ -1,139 +1,186 @@
 """r-hat: the Bradley-Terry fit, its resamples, and its level."""
 
-import functools
 import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import Point
+from conftest import Point, settings
 from scipy.stats import spearmanr
 
 from peps_jax.learning import surrogate
-from peps_jax.trajectory import Preferences, Segments, Transition
+from peps_jax.learning.surrogate import Examples
+from peps_jax.preferences import data
+from peps_jax.preferences.data import Answers, Segments
 
 NUMBER = 600
 
 
 @pytest.fixture(scope="module")
 def config(line):
-    """One round that learns from all preferences at once."""
-    return line.replace(
-        total_steps=40, num_queries=NUMBER, surrogate_updates=400, surrogate_batch_size=64, surrogate_learning_rate=1e-2,
-        surrogate_decay=0.0, model_hidden_sizes=(16,),
-    )  # fmt: skip
+    """A fit of many steps."""
+    return settings(
+        line.replace(
+            surrogate_updates=400, surrogate_batch_size=64, surrogate_learning_rate=1e-2, surrogate_decay=0.0,
+            model_hidden_sizes=(16,),
+        )
+    ).surrogate  # fmt: skip
 
 
-def random_segments(key, config, number=NUMBER, mask=None):
+STEPS = 5
+
+
+def random_segments(key, number=NUMBER, mask=None):
     """Pairs of segments with uniform observations and actions."""
     key_observation, key_action = jax.random.split(key)
-    shape = (number, 2, config.segment_length)
+    shape = (number, 2, STEPS)
     observation = jax.random.uniform(key_observation, (*shape, 1), minval=-1.0)
     action = jax.random.uniform(key_action, (*shape, 1), minval=-1.0)
     point = Point(observation, jnp.zeros(shape, jnp.int32))
-    return Segments(observation, action, jnp.ones(shape) if mask is None else mask, point, point)
+    return Segments(observation, action, jnp.ones(shape, bool) if mask is None else mask, point, point)
+
+
+def numbered(preferred, weight=None):
+    """Answers to queries from number 0 on."""
+    weight = jnp.ones(preferred.shape) if weight is None else weight
+    return Answers(jnp.arange(preferred.shape[0], dtype=jnp.int32), preferred, weight)
 
 
 def answered(key, segments, rewards):
     """What a rational human who feels `rewards` (n, 2, steps) answers."""
     difference = jnp.subtract(*jnp.moveaxis(jnp.sum(rewards * segments.mask, -1), -1, 0))
-    answers = jax.random.bernoulli(key, jax.nn.sigmoid(difference)).astype(jnp.float32)
-    return Preferences(segments, answers, jnp.ones_like(answers))
+    preferred = jax.random.bernoulli(key, jax.nn.sigmoid(difference)).astype(jnp.float32)
+    return data.recording(segments, numbered(preferred))
 
 
 def visited(key, number=512):
-    """Replay with uniform observations and actions."""
-    observation, action = jax.random.uniform(key, (2, number, 1), minval=-1.0)
-    zeros = jnp.zeros(number)
-    return Transition(observation, action, zeros, observation, zeros)
+    """Uniform observations and actions."""
+    return jax.random.uniform(key, (2, number, 1), minval=-1.0)
 
 
-@functools.partial(jax.jit, static_argnames="recipe")
-def taught(preferences, config, recipe=surrogate.PLAIN):
-    key_init, key_add, key_fit, key_visited = jax.random.split(jax.random.key(7), 4)
-    state = surrogate.add(surrogate.init(key_init, config), preferences, 0, key_add, config)
-    return surrogate.fit(state, visited(key_visited), NUMBER, 512, key_fit, config, recipe)
+@jax.jit
+def taught(preferences, config):
+    key_init, _, key_fit, key_visited = jax.random.split(jax.random.key(7), 4)
+    state, info = surrogate.fit(surrogate.init(key_init, config), preferences, key_fit, config)
+    return surrogate.pin(state, *visited(key_visited), config), info
 
 
-def queries_of(segments, config):
-    """The arguments of the loss that stand for `segments`."""
-    return jnp.concatenate([segments.observation, segments.action], -1), segments.mask
+def examples_of(segments, preferred, config, weights=None):
+    """What the loss sees of `segments`."""
+    features = jnp.concatenate([segments.observation, segments.action], -1)
+    number = segments.mask.shape[0]
+    weights = jnp.ones((number, config.ensemble_size)) if weights is None else weights
+    return Examples(features, segments.mask, jnp.broadcast_to(jnp.asarray(preferred, jnp.float32), number), weights)
 
 
 def test_loss_is_log_2_at_a_tie(config):
     state = surrogate.init(jax.random.key(0), config)
-    features, mask = queries_of(random_segments(jax.random.key(1), config, 6), config)
-    answers, weights = jnp.array([1.0, 0, 1, 0, 0.5, 1]), jnp.ones((6, config.ensemble_size))
+    examples = examples_of(random_segments(jax.random.key(1), 6), jnp.array([1.0, 0, 1, 0, 0.5, 1]), config)
     nothing = jax.tree.map(jnp.zeros_like, state.params)
-    np.testing.assert_allclose(
-        surrogate.loss(nothing, features, mask, answers, weights, config)[0], math.log(2), rtol=1e-6
-    )
-    equal = jnp.repeat(features[:, :1], 2, 1)
-    value, _ = surrogate.loss(state.params, equal, mask, answers, weights, config)
+    np.testing.assert_allclose(surrogate.loss(nothing, examples, config)[0], math.log(2), rtol=1e-6)
+    equal = examples._replace(features=jnp.repeat(examples.features[:, :1], 2, 1))
+    value, _ = surrogate.loss(state.params, equal, config)
     np.testing.assert_allclose(value, math.log(2), rtol=1e-6)
 
 
 def test_steps_after_a_segments_end_have_no_influence(config):
     state = surrogate.init(jax.random.key(0), config)
-    mask = jnp.ones((6, 2, config.segment_length)).at[:, 0, 2:].set(0.0)
-    segments = random_segments(jax.random.key(1), config, 6, mask)
-    features, _ = queries_of(segments, config)
-    other = jnp.where(mask[..., None] > 0, features, 100.0)
-    answers, weights = jnp.ones(6), jnp.ones((6, config.ensemble_size))
-    gradient = jax.grad(lambda *arguments: surrogate.loss(*arguments, config)[0])
-    for one, two in zip(
-        jax.tree.leaves(gradient(state.params, features, mask, answers, weights)),
-        jax.tree.leaves(gradient(state.params, other, mask, answers, weights)),
-        strict=True,
-    ):
+    mask = jnp.ones((6, 2, STEPS), bool).at[:, 0, 2:].set(False)
+    segments = random_segments(jax.random.key(1), 6, mask)
+    examples = examples_of(segments, 1.0, config)
+    other = examples._replace(features=jnp.where(mask[..., None], examples.features, 100.0))
+    gradient = jax.grad(lambda params, examples: surrogate.loss(params, examples, config)[0])
+    each = (jax.tree.leaves(gradient(state.params, examples)) for examples in (examples, other))
+    for one, two in zip(*each, strict=True):
         np.testing.assert_allclose(one, two, atol=1e-6)
     assert bool(jnp.any(surrogate.preference_logits(state, segments, config) != 0))
 
 
 def test_a_tie_counts_half_for_each(config):
     state = surrogate.init(jax.random.key(0), config)
-    features, mask = queries_of(random_segments(jax.random.key(1), config, 6), config)
-    loss = lambda answer: surrogate.loss(
-        state.params, features, mask, jnp.full(6, answer), jnp.ones((6, config.ensemble_size)), config
-    )[0]
+    segments = random_segments(jax.random.key(1), 6)
+    loss = lambda answer: surrogate.loss(state.params, examples_of(segments, answer, config), config)[0]
     np.testing.assert_allclose(loss(0.5), (loss(0.0) + loss(1.0)) / 2, rtol=1e-6)
     assert float(loss(0.0)) != float(loss(1.0))
 
 
 def test_weights_choose_what_a_member_sees(config):
     state = surrogate.init(jax.random.key(0), config)
-    features, mask = queries_of(random_segments(jax.random.key(1), config, 2), config)
     weights = jnp.zeros((2, config.ensemble_size)).at[1, 0].set(2.0)
-    value, _ = surrogate.loss(state.params, features, mask, jnp.array([1.0, 1.0]), weights, config)
-    sums = surrogate.segment_sums(state.params, features, mask, config)
+    examples = examples_of(random_segments(jax.random.key(1), 2), 1.0, config, weights)
+    value, _ = surrogate.loss(state.params, examples, config)
+    sums = surrogate.segment_sums(state.params, examples.features, examples.mask, config)
     np.testing.assert_allclose(value, np.logaddexp(0, -(sums[0, 1, 0] - sums[0, 1, 1])), rtol=1e-5)
 
 
-def test_resamples_are_poisson_and_only_of_answers(config):
-    config = config.replace(num_queries=NUMBER - 100, total_steps=40)
-    segments = random_segments(jax.random.key(1), config)
-    skipped = jnp.ones(NUMBER).at[:100].set(0.0)
-    state = surrogate.init(jax.random.key(0), config.replace(num_queries=NUMBER))
-    state = surrogate.add(state, Preferences(segments, jnp.ones(NUMBER), skipped), 0, jax.random.key(2), config)
-    weights = np.asarray(state.weights)
-    assert np.all(weights[:100] == 0), "skipped"
-    assert np.all(weights[-100:] == 0), "beyond the budget"
-    asked = weights[100:-100]
-    assert np.all(asked == np.round(asked))
-    assert abs(asked.mean() - 1) < 4 / math.sqrt(asked.size)
-    assert abs(asked.var() - 1) < 0.2
-    assert np.any(asked[:, 0] != asked[:, 1])
+def test_resamples_are_poisson_and_follow_from_a_querys_number():
+    bootstrap = jax.random.key_data(jax.random.key(3))
+    found = np.asarray(surrogate.resampled(bootstrap, jnp.arange(NUMBER), 5))
+    assert np.all(found == np.round(found))
+    assert abs(found.mean() - 1) < 4 / math.sqrt(found.size)
+    assert abs(found.var() - 1) < 0.2
+    assert np.any(found[:, 0] != found[:, 1])
+    assert abs(np.mean(found == 0) - math.exp(-1)) < 0.05, "what a resample leaves out is a share of 1/e"
+    np.testing.assert_array_equal(surrogate.resampled(bootstrap, jnp.array([17, 3]), 5), found[[17, 3]])
+
+
+def test_places_without_an_answer_weigh_nothing(config):
+    """Neither a query that nobody answered nor a place without one, whatever stands there."""
+    config = config.replace(updates=20)
+    key = jax.random.key(5)
+    segments = random_segments(jax.random.key(1), 40)
+    preferred = (jnp.arange(40) % 3 == 0).astype(jnp.float32)
+    few = data.recording(jax.tree.map(lambda rows: rows[:30], segments), numbered(preferred[:30]))
+    wild = segments._replace(observation=segments.observation.at[30:].set(1e6))
+    more = data.recording(wild, numbered(preferred, (jnp.arange(40) < 30).astype(jnp.float32)))
+    more = more.replace(number=more.number.at[35:].set(data.NOBODY))
+    state = surrogate.init(jax.random.key(0), config.replace(validates=True))
+    fit = jax.jit(lambda preferences: surrogate.fit(state, preferences, key, config.replace(validates=True)))
+    one, two = fit(few), fit(more)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), one, two)
+
+
+def test_it_makes_no_difference_in_which_order_answers_came(config):
+    """Rows shuffled, half of them late: at the end the fit is that of a set which had everything from the start."""
+    config = config.replace(updates=40)
+    segments = random_segments(jax.random.key(1))
+    preferred = jax.random.bernoulli(jax.random.key(2), shape=(NUMBER,)).astype(jnp.float32)
+    at_once = data.recording(segments, numbered(preferred))
+    order = np.random.default_rng(0).permutation(NUMBER)
+    late = jax.tree.map(lambda rows: rows[order], data.recording(segments, numbered(preferred, jnp.zeros(NUMBER))))
+    numbers = np.random.default_rng(1).permutation(NUMBER)
+    for now, some in ((0, numbers[: NUMBER // 2]), (7, numbers[NUMBER // 2 :])):
+        late = data.file(late, Answers(jnp.asarray(some), preferred[some], jnp.ones(len(some))), jnp.asarray(now))
+    state = surrogate.init(jax.random.key(0), config)
+    fit = jax.jit(lambda preferences: surrogate.fit(state, preferences, jax.random.key(5), config))
+    jax.tree.map(
+        lambda one, two: np.testing.assert_allclose(one, two, rtol=1e-6, atol=1e-7),
+        fit(at_once), fit(data.known(late, jnp.asarray(7))),
+    )  # fmt: skip
+    early = fit(data.known(late, jnp.asarray(6)))[0]
+    assert not np.allclose(jax.tree.leaves(early.params)[1], jax.tree.leaves(fit(at_once)[0].params)[1])
+
+
+def test_an_answer_of_three_people_counts_as_three(config):
+    state = surrogate.init(jax.random.key(0), config)
+    segments = random_segments(jax.random.key(1), 2)
+    three = data.recording(segments, numbered(jnp.array([1.0, 0.0]), jnp.array([3.0, 1.0])))
+    each = data.recording(segments, Answers(jnp.array([0, 0, 1, 0]), jnp.array([1.0, 1.0, 0.0, 1.0]), jnp.ones(4)))
+    jax.tree.map(np.testing.assert_array_equal, three, each)
+    examples = surrogate._examples(state, three, config)
+    copies = surrogate.resampled(state.bootstrap, jnp.arange(2), config.ensemble_size)
+    np.testing.assert_array_equal(examples.weights, copies * np.array([[3.0], [1.0]]))
 
 
 def test_fit_recovers_the_ranking_of_a_linear_reward(config):
-    segments = random_segments(jax.random.key(1), config)
+    segments = random_segments(jax.random.key(1))
     reward = lambda observation, action: 2 * observation[..., 0] - action[..., 0]
     preferences = answered(jax.random.key(2), segments, reward(segments.observation, segments.action))
     state, info = taught(preferences, config)
     seen = visited(jax.random.key(3))
-    learned = surrogate.predict(state, seen.observation, seen.action, config)
-    assert spearmanr(learned, reward(seen.observation, seen.action)).statistic > 0.95
+    learned = surrogate.predict(state, *seen, config)
+    assert spearmanr(learned, reward(*seen)).statistic > 0.95
     assert float(info["surrogate_loss"]) < math.log(2)
     assert float(info["preference_accuracy"]) > 0.7
 
@@ -141,23 +188,22 @@ def test_fit_recovers_the_ranking_of_a_linear_reward(config):
 def test_unequal_lengths_identify_the_level(config):
     cost = -0.7
     key_length, key_segments, key_answer = jax.random.split(jax.random.key(4), 3)
-    length = jax.random.randint(key_length, (NUMBER, 2, 1), 1, config.segment_length + 1)
-    mask = (jnp.arange(config.segment_length)[None, None] < length).astype(jnp.float32)
-    segments = random_segments(key_segments, config, mask=mask)
+    length = jax.random.randint(key_length, (NUMBER, 2, 1), 1, STEPS + 1)
+    mask = jnp.arange(STEPS)[None, None] < length
+    segments = random_segments(key_segments, mask=mask)
     state, _ = taught(answered(key_answer, segments, jnp.full(mask.shape, cost)), config)
-    seen = visited(jax.random.key(3))
-    learned = surrogate.predict(state, seen.observation, seen.action, config)
+    learned = surrogate.predict(state, *visited(jax.random.key(3)), config)
     assert abs(float(jnp.mean(learned)) - cost) < 0.2
 
 
 @pytest.mark.parametrize("level", ["none", "quantile", "max"])
 def test_level_is_pinned_over_replay(config, level):
-    segments = random_segments(jax.random.key(1), config)
+    segments = random_segments(jax.random.key(1))
     preferences = answered(jax.random.key(2), segments, segments.observation[..., 0])
-    config = config.replace(level=level, surrogate_updates=5)
+    config = config.replace(level=level, updates=5)
     state, _ = taught(preferences, config)
-    seen = visited(jax.random.split(jax.random.key(7), 4)[3])  # what `taught` has in replay
-    learned = np.asarray(surrogate.predict(state, seen.observation, seen.action, config))
+    seen = visited(jax.random.split(jax.random.key(7), 4)[3])  # what `taught` has visited
+    learned = np.asarray(surrogate.predict(state, *seen, config))
     if level == "none":
         assert set(np.asarray(state.shift)) == {0.0}
         assert set(np.asarray(state.scale)) == {1.0}
@@ -168,56 +214,46 @@ def test_level_is_pinned_over_replay(config, level):
 
 
 def test_the_level_standard_normalises_every_member(config):
-    segments = random_segments(jax.random.key(1), config)
+    segments = random_segments(jax.random.key(1))
     preferences = answered(jax.random.key(2), segments, segments.observation[..., 0])
-    state, _ = taught(preferences, config.replace(surrogate_updates=5), surrogate.Recipe(level="standard"))
+    state, _ = taught(preferences, config.replace(updates=5, level="standard"))
     seen = visited(jax.random.key(7), number=4096)
-    raw = surrogate.member_rewards(state, seen.observation, seen.action, config)
+    raw = surrogate.member_rewards(state, *seen, config)
     np.testing.assert_allclose(raw.mean(-1), state.shift, atol=0.15 * float(state.scale.max()))
     np.testing.assert_allclose(raw.std(-1), state.scale, rtol=0.15)
-    learned = surrogate.predict(state, seen.observation, seen.action, config)
+    learned = surrogate.predict(state, *seen, config)
     by_hand = np.mean((raw - np.asarray(state.shift)[:, None]) / np.asarray(state.scale)[:, None], 0)
     np.testing.assert_allclose(learned, by_hand, rtol=1e-4, atol=1e-5)
 
 
 def test_uniform_answers_bound_the_likelihood(config):
-    recipe = surrogate.Recipe(uniform_answers=0.1)
     difference = jnp.array([-200.0, -1.0, 0.0, 1.0, 200.0])
-    logits = surrogate.answer_logits(difference, recipe)
+    logits = surrogate.answer_logits(difference, 0.1)
     expected = 0.05 + 0.9 / (1 + np.exp(-np.asarray(difference, np.float64)))
     np.testing.assert_allclose(jax.nn.sigmoid(logits), expected, rtol=1e-4)
-    slope = jax.vmap(jax.grad(lambda value: surrogate.answer_logits(value, recipe)))(difference)
+    slope = jax.vmap(jax.grad(lambda value: surrogate.answer_logits(value, 0.1)))(difference)
     assert bool(jnp.all(jnp.isfinite(slope)))
-    np.testing.assert_array_equal(surrogate.answer_logits(difference, surrogate.PLAIN), difference)
+    np.testing.assert_array_equal(surrogate.answer_logits(difference, 0.0), difference)
 
     state = surrogate.init(jax.random.key(0), config)
-    features, mask = queries_of(random_segments(jax.random.key(1), config, 6), config)
+    examples = examples_of(random_segments(jax.random.key(1), 6), 0.0, config)
     sure = jax.tree.map(lambda leaf: 1e3 * leaf, state.params)
-    arguments = (sure, features, mask, jnp.zeros(6), jnp.ones((6, config.ensemble_size)), config)
-    assert float(surrogate.loss(*arguments)[0]) > -math.log(0.05)
-    assert float(surrogate.loss(*arguments, recipe)[0]) <= -math.log(0.05) + 1e-5, "an error costs at most this"
-
-
-def test_what_a_resample_leaves_out_is_a_share_of_1_over_e(config):
-    segments = random_segments(jax.random.key(1), config)
-    state = surrogate.init(jax.random.key(0), config)
-    state = surrogate.add(
-        state, Preferences(segments, jnp.ones(NUMBER), jnp.ones(NUMBER)), 0, jax.random.key(2), config
-    )
-    assert abs(float(jnp.mean(state.weights == 0)) - math.exp(-1)) < 0.05
+    loss = lambda config: float(surrogate.loss(sure, examples, config)[0])
+    assert loss(config) > -math.log(0.05)
+    assert loss(config.replace(uniform_answers=0.1)) <= -math.log(0.05) + 1e-5, "an error costs at most this"
 
 
 @pytest.mark.parametrize(("noisy", "grows"), [(True, True), (False, False)])
 def test_weight_decay_follows_the_validation_loss(config, noisy, grows):
     """Up where members learn random answers by heart, down where what they learn holds for all."""
-    segments = random_segments(jax.random.key(1), config)
+    segments = random_segments(jax.random.key(1))
     preferences = answered(jax.random.key(2), segments, 5 * segments.observation[..., 0])
     if noisy:
         coins = jax.random.bernoulli(jax.random.key(3), shape=(NUMBER,)).astype(jnp.float32)
         few = (jnp.arange(NUMBER) < 60).astype(jnp.float32)
-        preferences = preferences._replace(answers=coins, answered=few)
-    config = config.replace(surrogate_decay=1e-2, surrogate_learning_rate=3e-2 if noisy else 1e-3)
-    state, info = taught(preferences, config, surrogate.Recipe(validates=True))
+        preferences = preferences.replace(preferred=coins, weight=few)
+    config = config.replace(decay=jnp.float32(1e-2), learning_rate=jnp.float32(3e-2 if noisy else 1e-3))
+    state, info = taught(preferences, config.replace(validates=True))
     ratio = float(info["surrogate_validation_ratio"])
     low, high = surrogate.VALIDATION_RATIO
     assert ratio > high if grows else ratio < low

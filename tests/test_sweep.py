@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import exit_code, is_one_complaint
+from conftest import untrained
 
 import peps_envs
 import peps_jax
-from peps_jax.execution import batches, memory
+from peps_jax.execution import batches, memory, program
 from peps_jax.sweep import command, pictures, results
-from peps_jax.train import finish, init
 
 EPISODES = 4
 
@@ -75,7 +75,7 @@ def refuse_to_compile(*arguments):
     ],
 )
 def test_bad_input_is_one_line(arguments, parts, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(batches, "Program", refuse_to_compile)
+    monkeypatch.setattr(program, "Program", refuse_to_compile)
     assert call([*arguments.split(), "--out", str(tmp_path / "out")]) == 2
     assert is_one_complaint(capsys.readouterr(), command.PROG, parts)
     assert not list(tmp_path.iterdir())
@@ -98,7 +98,7 @@ def test_a_file_is_no_folder(tmp_path, capsys):
 
 
 def test_too_little_memory_is_said_before_compiling(tmp_path, capsys, monkeypatch, tiny):
-    monkeypatch.setattr(batches, "Program", refuse_to_compile)
+    monkeypatch.setattr(program, "Program", refuse_to_compile)
     monkeypatch.setattr(memory, "available_bytes", lambda devices: 10_000)
     assert call([*tiny_flags(tiny), "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
@@ -136,7 +136,7 @@ def test_importing_the_library_meets_no_device():
 
 
 def test_worlds_share_a_program_and_methods_do_not(tiny, monkeypatch):
-    monkeypatch.setattr(batches, "memory_need", lambda config, num_episodes: memory.Need(1000, 1000))
+    monkeypatch.setattr(batches, "memory_need", lambda *_: memory.Need(1000, 1000))
     cells = [tiny.replace(env=env, method=method) for env in ("nav-d1", "nav-d3") for method in ("peps", "sac")]
     planned = batches.plan(cells, EPISODES, free=10**9)
     assert [one.cells for one in planned] == [(0, 2), (1, 3)]
@@ -144,7 +144,7 @@ def test_worlds_share_a_program_and_methods_do_not(tiny, monkeypatch):
 
 def test_what_does_not_fit_is_split_into_batches_of_one_size(line):
     cells = [line.replace(seed=seed) for seed in range(7)]
-    need = batches.memory_need(line, EPISODES)
+    need = program.memory_need(line, EPISODES)
     two_per_device = int((memory.bytes_needed(need, 2, together=False) + 100) / memory.AVAILABLE_SHARE)
     planned = batches.plan(cells, EPISODES, free=two_per_device)
     assert [one.slots for one in planned] == [4, 4]
@@ -162,10 +162,10 @@ def test_side_by_side_every_cell_needs_its_working_memory():
 
 
 def test_predicted_memory_grows_as_what_it_counts(line):
-    need = lambda **changes: batches.memory_need(line.replace(method="sac", **changes), EPISODES)
+    need = lambda **changes: program.memory_need(line.replace(method="sac", **changes), EPISODES)
     base, wider, longer = need(batch_size=1024), need(batch_size=2048), need(total_steps=16_000)
     assert 1.5 * base.working < wider.working < 2.5 * base.working
-    transition = 4 * (1 + 1 + 1 + 1 + 1)  # bytes: two observations, action, reward, terminated
+    transition = 4 * (1 + 1 + 1 + 1 + 1) + 1  # bytes: two observations, action, reward, movement; terminated
     assert longer.state - base.state == (16_000 - 160) * transition
 
 
@@ -173,8 +173,10 @@ def test_predicted_memory_grows_as_what_it_counts(line):
 @pytest.mark.parametrize(("method", "width", "size"), [("sac", 128, 256), ("peps", 64, 256)])
 def test_predicted_memory_is_what_xla_reports(method, width, size):
     config = peps_jax.Config(method=method, hidden_sizes=(width, width), batch_size=size, total_steps=32_000)
-    used = batches.Program(config, 2, 100, jax.devices()[:1]).bytes_used
-    predicted = memory.bytes_needed(batches.memory_need(config, 100), 2, together=False)
+    compiled = program.Program(config, 2, 100, jax.devices()[:1])
+    compiled.compile()
+    used = compiled.bytes_used
+    predicted = memory.bytes_needed(program.memory_need(config, 100), 2, together=False)
     assert 0.97 * used < predicted < 1.2 * used
 
 
@@ -195,10 +197,10 @@ def test_values_in_use_at_once_are_counted():
 
 @pytest.mark.parametrize("num_rounds", [1, 2, 4, 39, 75, 97, 400, 997, 5003, 10_000])
 def test_chunks_make_whole_trainings_of_at_most_two_programs(num_rounds):
-    chunks = batches.chunk_lengths(num_rounds)
+    chunks = program.chunk_lengths(num_rounds)
     assert sum(chunks) == num_rounds
     assert len(set(chunks)) <= 2
-    assert len(chunks) <= 5 * batches.REPORTS
+    assert len(chunks) <= 5 * program.REPORTS
 
 
 # --- running --------------------------------------------------------------------------------------------------------------
@@ -263,8 +265,8 @@ def test_a_loaded_cell_acts_and_scores_as_it_did(swept, tiny):
     third = peps_jax.load(swept, {"method": "peps", "lam": 2.4, "seed": 4})
     for other in (again, third):
         jax.tree.map(np.testing.assert_array_equal, result.agents, other.agents)
-    assert result.act(jnp.zeros(tiny.task()[0].observation_size)).shape == (2,)
-    evaluation = jax.jit(peps_jax.evaluate, static_argnums=2)(result, result.config, EPISODES)
+    assert result.act(jnp.zeros(tiny.problem().environment.observation_size)).shape == (2,)
+    evaluation = jax.jit(peps_jax.evaluate, static_argnums=1)(result, EPISODES)
     np.testing.assert_allclose(evaluation.return_.mean(), float(row["return_mean"]), rtol=1e-4)
     np.testing.assert_allclose(evaluation.explicability.mean(), float(row["explicability_mean"]), rtol=1e-4)
     assert result.curves["preference_accuracy"].shape == (4,)
@@ -299,8 +301,7 @@ def test_every_method_with_a_surrogate_reward_has_its_heat_map(tiny):
     rows = []
     for method in ("peps", "sac", "drlhp"):
         config = tiny.replace(method=method)
-        finished = batches.Finished(finish(jax.jit(init)(config), {}, config), evaluation=None, failed=False)
-        rows += [results.Row(results.Cell("nav-d1", method, 2.4, seed, "any"), finished) for seed in (0, 1)]
+        rows += [results.Row(results.Cell("nav-d1", method, 2.4, seed, "any"), untrained(config)) for seed in (0, 1)]
     titles = [axes.get_ylabel() for axes in pictures.surrogate_maps(rows).axes]
     assert [title for title in titles if title.startswith("nav")] == ["nav-d1, peps, seed 0", "nav-d1, drlhp, seed 0"]
 
@@ -355,7 +356,7 @@ def test_an_interrupted_sweep_keeps_what_is_finished(line, line_task, tmp_path, 
 def test_a_cell_alone_in_a_split_batch_and_beside_a_failing_one(line, train):
     cells = [line.replace(method="peps", seed=seed) for seed in (3, 4, 5)]
     cells[1] = cells[1].replace(learning_rate=float("nan"))
-    need = batches.memory_need(cells[0], EPISODES)
+    need = program.memory_need(cells[0], EPISODES)
     one_per_device = int((memory.bytes_needed(need, 1, together=False) + 100) / memory.AVAILABLE_SHARE)
     planned = batches.plan(cells, EPISODES, free=one_per_device)
     assert [one.cells for one in planned] == [(0, 1), (2,)]
@@ -375,12 +376,12 @@ def test_a_cell_alone_in_a_split_batch_and_beside_a_failing_one(line, train):
 
     alone = train(cells[2])
     for name, curve in alone.curves.items():
-        np.testing.assert_allclose(finished[2].result.curves[name], curve, rtol=1e-3, atol=1e-4, err_msg=name)
+        np.testing.assert_allclose(finished[2].curves[name], curve, rtol=1e-3, atol=1e-4, err_msg=name)
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
-    jax.tree.map(close, finished[2].result.agents[0].policy, alone.agents[0].policy)
+    jax.tree.map(close, finished[2].agents[0].policy, alone.agents[0].policy)
 
 
-def test_a_failed_cell_is_a_row_that_says_so(tiny):
+def test_a_failed_cell_is_a_row_that_says_so(line):
     evaluation = peps_jax.Evaluation(
         score=peps_jax.explicability.Score(*np.full((4, 2), np.nan)),
         log_policy=np.zeros(2),
@@ -388,8 +389,8 @@ def test_a_failed_cell_is_a_row_that_says_so(tiny):
         events={"goal_reached": np.array([True, False])},
         perceived=np.zeros((2, 3, 2)),
     )
-    finished = batches.Finished(result=None, evaluation=evaluation, failed=True)
-    record = results.record(results.Row(results.Cell("nav-d1", "peps", 2.4, 0, training="x"), finished))
+    failed = untrained(line).replace(evaluation=evaluation, failed=True)
+    record = results.record(results.Row(results.Cell("nav-d1", "peps", 2.4, 0, training="x"), failed))
     assert record["status"] == "failed"
     assert record["goal_rate"] == 0.5
     assert np.isnan(record["return_mean"])

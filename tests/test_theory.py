@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from conftest import settings
 from flax import struct
 from jax import Array
 from scipy.stats import spearmanr
@@ -14,9 +15,10 @@ from scipy.stats import spearmanr
 import peps_envs
 from peps_envs import Discrete, Environment, PerceivedDensity, Step
 from peps_jax import Config, rollout
+from peps_jax.config import Problem
 from peps_jax.evaluate import evaluate_policy
 from peps_jax.learning import policy_heads, surrogate
-from peps_jax.preferences import queries, synthetic_human
+from peps_jax.preferences import data, queries, synthetic_human
 
 # --- Eq. (4) --------------------------------------------------------------------------------------------------------------
 
@@ -78,7 +80,7 @@ class Chain(Environment):
     def perceive(self, state: ChainState) -> Array:
         return state.place.astype(jnp.float32)[None]
 
-    perceive_observation = perception_width = None
+    perception_width = None
 
 
 def chain(seed: int) -> tuple[ChainParams, np.ndarray]:
@@ -114,7 +116,7 @@ def test_the_metric_is_the_divergence_of_eq_3():
     head = policy_heads.discrete_head(1, ACTIONS)
     table = jnp.asarray(logits, jnp.float32)
     act = lambda observation, key: head.sample(table[observation[0].astype(jnp.int32)], head.noise(key, ()))
-    roll = lambda key: evaluate_policy(act, Chain(), params, belief, key, 40_000, stochastic=True)
+    roll = lambda key: evaluate_policy(act, Problem(Chain(), params, belief), key, 40_000, stochastic=True)
     episodes = jax.jit(roll)(jax.random.key(0))
     # l_pi is relative to the uniform policy: log pi = l_pi - log ACTIONS
     found = np.asarray(episodes.explicability_with_policy, np.float64) + HORIZON * np.log(ACTIONS) - log_normaliser
@@ -129,25 +131,23 @@ def test_the_metric_is_the_divergence_of_eq_3():
 @jax.jit
 def taught_by_random_walks(config):
     """r-hat, l_H, r_H and r_A of every step of random walks, after answers about pieces of them."""
-    key_actors, key_act, key_hold, key_pairs, key_answer, key_init, key_add, key_fit = jax.random.split(
-        jax.random.key(0), 8
-    )
+    key_actors, key_act, key_hold, key_pairs, key_answer, key_init, _, key_fit = jax.random.split(jax.random.key(0), 8)
+    problem, own = config.problem(), settings(config)
 
     def act(observation, key, time):
         held = jax.random.fold_in(key_hold, time // config.hold_steps)
         return jax.random.uniform(held, (config.num_envs, 2), minval=-1.0)
 
-    _, walk, _ = rollout.collect(rollout.init(key_actors, config), act, key_act, config)
-    pairs = jax.tree.map(lambda rows: rows[: config.num_queries], queries.candidates(walk, key_pairs, config))
-    preferences = synthetic_human.answer(key_answer, pairs, config)
-    state = surrogate.add(surrogate.init(key_init, config), preferences, 0, key_add, config)
+    _, walk, _ = rollout.collect(rollout.init(key_actors, problem, own.rollout), act, key_act, problem, own.rollout)
+    pairs = jax.tree.map(lambda rows: rows[: config.num_queries], queries.candidates(walk, key_pairs, own.queries))
+    asked = data.Queries(jnp.arange(config.num_queries, dtype=jnp.int32), pairs)
+    preferences = data.recording(pairs, synthetic_human.answer(key_answer, asked, problem, own.human))
+    state, _ = surrogate.fit(surrogate.init(key_init, own.surrogate), preferences, key_fit, own.surrogate)
     seen = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), walk)
     steps = seen.transition
-    state, _ = surrogate.fit(state, steps, config.num_queries, config.total_steps, key_fit, config)
-    environment, _, belief = config.task()
-    weigh = jax.vmap(lambda *step: synthetic_human.log_weight(environment, belief, *step))
+    weigh = jax.vmap(lambda *step: synthetic_human.log_weight(problem.environment, problem.belief, *step))
     expected, wanted = weigh(seen.state, steps.action, seen.next_state)
-    return surrogate.predict(state, steps.observation, steps.action, config), expected, wanted, steps.reward
+    return surrogate.predict(state, steps.observation, steps.action, own.surrogate), expected, wanted, steps.reward
 
 
 def walks(belief):
@@ -188,7 +188,7 @@ def test_without_bias_explicability_is_the_return():
         return jax.random.uniform(key, (2,), minval=-1.0), jnp.zeros(())
 
     roll = lambda belief: evaluate_policy(
-        walk, task.environment, task.params, belief, jax.random.key(0), 16, stochastic=True
+        walk, Problem(task.environment, task.params, belief), jax.random.key(0), 16, stochastic=True
     )
     rolled = jax.jit(roll)
     unbiased, biased = rolled(task.beliefs["unbiased"]), rolled(task.beliefs["biased"])

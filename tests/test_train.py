@@ -9,10 +9,10 @@ from conftest import Line, LineParams
 
 import peps_jax
 from peps_jax import grid
-from peps_jax.preferences import synthetic_human
-from peps_jax.preferences.synthetic_human import Teacher
-from peps_jax.train import annealed_temperature, collect_and_ask, finish, init, learn_and_improve, run_round, run_rounds
-from peps_jax.trajectory import Preferences
+from peps_jax.preferences.data import Answers
+from peps_jax.preferences.teachers import Teacher
+from peps_jax.round import annealed_temperature, round_at
+from peps_jax.train import collect_and_ask, finish, hear, init, learn_and_improve, prepare, run_round, run_rounds
 
 CURVES = {"return_", "explicability", "belief_gap", "length", "critic_loss", "policy_entropy", "temperature"}
 LEARNED = {"dynamics_loss", "surrogate_loss", "preference_accuracy"}
@@ -130,24 +130,26 @@ def test_inside_somebody_elses_scan(line, train):
 def test_a_host_loop_gives_the_scans_numbers(line, first_state, rounds):
     """Rounds one by one, in two halves with the teacher between them."""
     collect, learn = jax.jit(collect_and_ask), jax.jit(learn_and_improve)
-    whole, curves = rounds(first_state(line), jnp.arange(line.num_rounds), line)
-    state = first_state(line)
+    training = prepare(line)
+    answer = jax.jit(training.answer)
+    whole, curves = rounds(first_state(training), jnp.arange(line.num_rounds), training)
+    state = first_state(training)
     for index in range(line.num_rounds):
-        # the teacher's key is the round's third, as in `run_round`
-        key_teacher = jax.random.split(jax.random.fold_in(state.key, index), 5)[2]
-        state, queries, collected = collect(state, jnp.asarray(index), line)
-        preferences = jax.jit(synthetic_human.answer)(key_teacher, queries, line)
-        state, learned = learn(state, jnp.asarray(index), preferences, line)
+        now = round_at(jnp.asarray(index), state.key, training.settings.schedule)
+        state, queries, collected = collect(state, now, training)
+        answers = answer(now.keys.answer, queries, training.problem, training.settings.human)
+        state, learned = learn(hear(state, answers, now), now, training)
         for name, value in (collected | learned).items():
             np.testing.assert_allclose(value, curves[name][index], rtol=1e-3, atol=1e-4, err_msg=name)
     assert_close(state, whole, rtol=1e-3, atol=1e-4)
 
 
 def test_a_round_at_a_time_gives_the_scans_numbers(line, first_state, rounds, step):
-    whole, _ = rounds(first_state(line), jnp.arange(line.num_rounds), line)
-    state = first_state(line)
+    training = prepare(line)
+    whole, _ = rounds(first_state(training), jnp.arange(line.num_rounds), training)
+    state = first_state(training)
     for index in range(line.num_rounds):
-        state, _ = step(state, jnp.asarray(index), line)
+        state, _ = step(state, jnp.asarray(index), training)
     assert_close(state, whole, rtol=1e-3, atol=1e-4)
 
 
@@ -162,55 +164,48 @@ def test_nothing_makes_nan_in_a_round_in_which_no_episode_ends(line, method):
 
 
 def test_a_saved_state_continues_as_if_nothing_had_been(line, first_state, step, tmp_path):
-    state, _ = step(first_state(line), jnp.asarray(0), line)
+    training = prepare(line)
+    state, _ = step(first_state(training), jnp.asarray(0), training)
     raw = state.replace(key=jax.random.key_data(state.key))
     np.savez(tmp_path / "state.npz", *jax.tree.leaves(raw))
     with np.load(tmp_path / "state.npz") as file:
         leaves = [jnp.asarray(file[name]) for name in file.files]
     loaded = jax.tree.unflatten(jax.tree.structure(raw), leaves)
     loaded = loaded.replace(key=jax.random.wrap_key_data(loaded.key))
-    whole, curves = step(state, jnp.asarray(1), line)
-    resumed, after = step(loaded, jnp.asarray(1), line)
+    whole, curves = step(state, jnp.asarray(1), training)
+    resumed, after = step(loaded, jnp.asarray(1), training)
     assert_close(resumed, whole, rtol=0, atol=0)
     chex.assert_trees_all_equal(after, curves)
-    assert finish(resumed, after, line).act(jnp.zeros(1)).shape == (1,)
+    assert finish(resumed, after, training).act(jnp.zeros(1)).shape == (1,)
 
 
-def test_a_person_is_a_teacher(line, train):
+def further_right(key, queries, problem, settings):
     """Somebody who always prefers the segment that ends further to the right, and skips every other query."""
+    del key, problem, settings
+    segments = queries.segments
+    end = jnp.sum(segments.mask, -1, keepdims=True).astype(int) - 1
+    last = jnp.take_along_axis(segments.next_state.place[..., 0], end, -1)[..., 0]
+    preferred = (last[:, 0] > last[:, 1]).astype(jnp.float32)
+    return Answers(queries.number, preferred, jnp.arange(preferred.size) % 2.0)
 
-    def answer(key, segments, config):
-        del key, config
-        end = jnp.sum(segments.mask, -1, keepdims=True).astype(int) - 1
-        last = jnp.take_along_axis(segments.next_state.place[..., 0], end, -1)[..., 0]
-        answers = (last[:, 0] > last[:, 1]).astype(jnp.float32)
-        return Preferences(segments, answers, jnp.arange(answers.size) % 2.0)
 
-    person = Teacher(answer=answer)
-    result = jax.jit(lambda config: peps_jax.train(config, person))(line)
-    surrogate = result.knowledge.surrogate
-    by_round = surrogate.weights.reshape(line.num_rounds, line.queries_per_round, line.ensemble_size)
-    assert bool(jnp.all(by_round[:, ::2] == 0)), "a skipped query teaches nothing"
-    assert bool(jnp.any(by_round[:, 1::2] > 0))
-    assert set(np.unique(surrogate.answers)) <= {0.0, 1.0}
+def test_anybody_is_a_teacher(line, train):
+    result = jax.jit(lambda config: peps_jax.train(config, Teacher(answer=further_right)))(line)
+    given = jax.tree.map(np.asarray, result.preferences)
+    by_round = given.weight.reshape(line.num_rounds, line.queries_per_round)
+    np.testing.assert_array_equal(by_round, np.tile(np.arange(line.queries_per_round) % 2.0, (line.num_rounds, 1)))
+    assert set(np.unique(given.preferred)) <= {0.0, 1.0}
+    np.testing.assert_array_equal(given.number, np.arange(line.num_queries))
     assert not np.allclose(result.curves["surrogate_loss"], train(line).curves["surrogate_loss"])
 
 
-def test_a_persons_answers_enter_between_the_halves(line, first_state):
-    state, queries, _ = jax.jit(collect_and_ask)(first_state(line), jnp.asarray(0), line)
-    number = line.queries_per_round
-    assert queries.mask.shape == (number, 2, line.segment_length)
-    answers = jnp.resize(jnp.array([1.0, 0.0, 0.5]), number)  # from a file, say
-    preferences = Preferences(queries, answers, jnp.ones(number))
-    state, info = jax.jit(learn_and_improve)(state, jnp.asarray(0), preferences, line)
-    np.testing.assert_array_equal(state.knowledge.surrogate.answers[:number], answers)
-    assert np.isfinite(float(info["surrogate_loss"]))
-
-
 def test_sac_asks_nothing(line, first_state):
-    config = line.replace(method="sac")
-    _, queries, _ = jax.jit(collect_and_ask)(first_state(config), jnp.asarray(0), config)
+    training = prepare(line.replace(method="sac"))
+    state = first_state(training)
+    now = round_at(jnp.asarray(0), state.key, training.settings.schedule)
+    state, queries, _ = jax.jit(collect_and_ask)(state, now, training)
     assert queries is None
+    assert state.preferences is None
 
 
 def test_an_unbiased_human_has_no_belief_gap(line, train):
@@ -223,17 +218,20 @@ def test_an_unbiased_human_has_no_belief_gap(line, train):
 
 
 def test_the_unbiased_preset_is_the_truth(tiny):
-    _, params, belief = tiny.replace(belief="unbiased").task()
-    chex.assert_trees_all_equal(params, belief)
+    problem = tiny.replace(belief="unbiased").problem()
+    chex.assert_trees_all_equal(problem.params, problem.belief)
 
 
 def test_replay_holds_what_happened(line, first_state, rounds):
-    state, _ = rounds(first_state(line), jnp.arange(line.num_rounds), line)
+    training = prepare(line)
+    state, _ = rounds(first_state(training), jnp.arange(line.num_rounds), training)
     buffer = state.replay
     assert buffer.reward.shape == (line.num_rounds * line.steps_per_round,)
     np.testing.assert_allclose(buffer.next_observation, buffer.observation + 0.1 * buffer.action, atol=1e-5)
     np.testing.assert_allclose(buffer.reward, buffer.next_observation[:, 0], atol=1e-5)  # r_A alone, nothing relabelled
-    np.testing.assert_array_equal(buffer.terminated > 0, buffer.next_observation[:, 0] > 0.25)
+    np.testing.assert_allclose(buffer.movement, buffer.action, atol=1e-4)  # 0.1 of it, in perceptual widths of 0.1
+    assert buffer.terminated.dtype == bool
+    np.testing.assert_array_equal(buffer.terminated, buffer.next_observation[:, 0] > 0.25)
 
 
 def test_result_acts_by_mode_and_by_samples(line, train):
@@ -251,7 +249,8 @@ def test_the_temperature_fades_geometrically(line):
     config = line.replace(
         initial_temperature=4.0, temperature=1.0, anneal_share=0.5, total_steps=10 * line.steps_per_round
     )
-    at = lambda index: float(annealed_temperature(jnp.asarray(index), config))
+    schedule = prepare(config).settings.schedule
+    at = lambda index: float(annealed_temperature(jnp.asarray(index), schedule))
     assert config.num_rounds == 10
     assert at(0) == pytest.approx(4.0)
     assert at(2.5) == pytest.approx(2.0)  # half of the way on a logarithmic scale
@@ -262,7 +261,10 @@ def test_the_temperature_fades_geometrically(line):
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_exploring_environments_hold_random_actions(line, share):
     config = line.replace(warmup_steps=0, exploration=share, hold_steps=5)
-    state, _, _ = jax.jit(collect_and_ask)(init(config), jnp.asarray(0), config)
+    training = prepare(config)
+    state = init(training)
+    now = round_at(jnp.asarray(0), state.key, training.settings.schedule)
+    state, _, _ = jax.jit(collect_and_ask)(state, now, training)
     rows = config.rollout_length // 5 * 5
     actions = state.replay.action[: config.steps_per_round].reshape(config.rollout_length, config.num_envs, -1)[:rows]
     blocks = actions.reshape(-1, 5, *actions.shape[1:])

@@ -18,6 +18,7 @@ from jax import Array
 
 from peps_envs.navigation import Navigation, NavigationParams, NavigationState, inside
 from peps_envs.registry import unknown_name
+from peps_jax.config import Problem
 from peps_jax.evaluate import Evaluation, Policy, evaluate_policy
 
 OBJECTIVES = ("return", "human", "peps")
@@ -139,4 +140,4 @@ def walk(
     """Episodes of the plan for `objective`, in the dynamics that it is made for; `how` as `solve` takes it."""
     plan = solve(params, belief, objective, lam, **how)
     acting = belief if objective == "human" else params
-    return evaluate_policy(plan.policy, environment, acting, belief, jax.random.key(0), num_episodes)
+    return evaluate_policy(plan.policy, Problem(environment, acting, belief), jax.random.key(0), num_episodes)

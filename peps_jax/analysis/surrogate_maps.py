@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
-from peps_envs.navigation import Navigation, NavigationState
-from peps_jax.config import Config
+from peps_envs.navigation import NavigationState
+from peps_jax.config import Problem
 from peps_jax.learning import surrogate
+from peps_jax.learning.surrogate import SurrogateState
 from peps_jax.preferences import synthetic_human
+from peps_jax.settings import SurrogateSettings
 from peps_jax.train import Result
 
 DIRECTIONS = 16  # of full steps, over which the heat maps take the mean
@@ -26,30 +28,32 @@ def surrogate_values(result: Result, resolution: int = 61) -> tuple[np.ndarray, 
       true: (resolution, resolution) E[l_H(s'|s,a) + r_H(s,a,s')] in the true dynamics.
       free: (resolution, resolution) bool, whether an episode can be at the position and go on.
     """
-    config = result.config
-    environment, params, belief = config.task()
+    problem = result.training.problem
+    params = problem.params
     ticks = (np.arange(resolution) + 0.5) / resolution
     positions = jnp.asarray(np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2), jnp.float32) * params.size[None]
     angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     actions = jnp.asarray(np.stack([np.cos(angles), np.sin(angles)], -1), jnp.float32)
-    numbers = config.replace(seed=0, params=params, belief=belief)  # leaves of one kind for every cell: one program
-    learned, true = _surrogate_values(environment, numbers, result.knowledge.surrogate, positions, actions)
+    settings = result.training.settings.surrogate
+    learned, true = _surrogate_values(problem, settings, result.surrogate, positions, actions)
     places, shape = np.asarray(positions), (resolution, resolution)
     within = lambda area: np.all((places >= np.asarray(area)[:2]) & (places <= np.asarray(area)[2:]), -1)
     ended = np.any([within(area) for area in (params.pit, params.goal, *params.walls)], 0)
     return np.asarray(learned).reshape(shape), np.asarray(true).reshape(shape), ~ended.reshape(shape)
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def _surrogate_values(environment: Navigation, config: Config, state: Any, positions: Any, actions: Any) -> Any:
-    _, params, belief = config.task()
+@jax.jit
+def _surrogate_values(
+    problem: Problem, settings: SurrogateSettings, state: SurrogateState, positions: Array, actions: Array
+) -> tuple[Array, Array]:
+    environment, params, belief = problem.environment, problem.params, problem.belief
 
     def at(position: Any, action: Any) -> tuple[Any, Any]:
         before = NavigationState(position, jnp.zeros((), jnp.int32))
         weights, places = environment.next_state_distribution(before, action, params).quadrature(3)
         after = jax.vmap(lambda place: NavigationState(place, jnp.ones((), jnp.int32)))(places)
         weigh = lambda after: sum(synthetic_human.log_weight(environment, belief, before, action, after))
-        learned = surrogate.predict(state, environment.observe(before, params), action, config)
+        learned = surrogate.predict(state, environment.observe(before, params), action, settings)
         return learned, weights @ jax.vmap(weigh)(after)
 
     values = jax.vmap(jax.vmap(at, in_axes=(None, 0)), in_axes=(0, None))(positions, actions)

@@ -16,7 +16,7 @@ import numpy as np
 from peps_envs import Environment
 from peps_envs.scene import Circle, Polyline, Rectangle, Scene, Shape, Text
 from peps_jax.drawing.panels import INK, colour, panels_of
-from peps_jax.trajectory import Segments
+from peps_jax.preferences.data import Segments
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -24,7 +24,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from peps_jax.execution.batches import Progress
+from peps_jax.execution.program import Progress
 from peps_jax.storage import files
 from peps_jax.train import TrainingState
 

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from peps_jax.config import Config
-from peps_jax.execution import batches
+from peps_jax.execution import batches, program
+from peps_jax.execution.program import FinishedRun, Times
 
 PATIENCE = 10.0  # s between two lines of progress where there is no terminal
 
-Keep = Callable[[batches.Batch, Sequence[batches.Finished], batches.Times], None]
+Keep = Callable[[batches.Batch, Sequence[FinishedRun], Times], None]
 
 
 def env_steps(config: Config) -> int:
@@ -83,7 +84,7 @@ class Display(batches.Watch):
         self._before, self._started = self._done, time.perf_counter()
         self._printed = self._started
 
-    def finished(self, batch: batches.Batch, cells: Sequence[batches.Finished], times: batches.Times) -> None:
+    def finished(self, batch: batches.Batch, cells: Sequence[FinishedRun], times: Times) -> None:
         self._keep(batch, cells, times)
 
     def _described(self, batch: batches.Batch) -> str:
@@ -94,7 +95,7 @@ class Display(batches.Watch):
         return sum(self._configs[place].steps_per_round for place in batch.cells)
 
     def advanced(
-        self, batch: batches.Batch, rounds: int, curves: dict[str, np.ndarray], snapshot: Callable[[], batches.Progress]
+        self, batch: batches.Batch, rounds: int, curves: dict[str, np.ndarray], snapshot: Callable[[], program.Progress]
     ) -> None:
         self._done += self._steps_per_round(batch) * next(iter(curves.values())).shape[1]
         ended = curves["episodes"] > 0

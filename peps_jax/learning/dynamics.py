@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import chex
 import distrax
 import jax
 import jax.numpy as jnp
@@ -19,10 +20,9 @@ import optax
 from flax import struct
 from jax import Array
 
-import peps_envs
-from peps_jax.config import Config
 from peps_jax.learning import replay
 from peps_jax.learning.networks import MLP, apply_ensemble, feature_size, features_of, init_ensemble
+from peps_jax.settings import DynamicsSettings
 from peps_jax.trajectory import Transition
 
 MIN_LOG_SD, MAX_LOG_SD = -4.0, 3.0  # in units of sigma_p: the floor's entropy is below 2e-4 nats
@@ -43,23 +43,21 @@ class Prediction(NamedTuple):
     log_sd: Array  # (..., perceived_size)
 
 
-def _network(config: Config) -> MLP:
-    environment, params, _ = config.task()
-    return MLP(config.model_hidden_sizes, 2 * environment.perception_width(params).shape[0], output_scale=0.1)
+def _network(settings: DynamicsSettings) -> MLP:
+    return MLP(settings.hidden_sizes, 2 * settings.perceived_size, output_scale=0.1)
 
 
-def init(key: Array, config: Config) -> DynamicsState:
+def init(key: Array, settings: DynamicsSettings) -> DynamicsState:
     """An untrained ensemble."""
-    environment, _, _ = config.task()
-    params = init_ensemble(_network(config), key, config.ensemble_size, feature_size(environment))
-    return DynamicsState(params=params, optimizer=optax.adam(config.dynamics_learning_rate).init(params))
+    size = feature_size(settings.observation_size, settings.action_space)
+    params = init_ensemble(_network(settings), key, settings.ensemble_size, size)
+    return DynamicsState(params=params, optimizer=optax.adam(settings.learning_rate).init(params))
 
 
-def predict(params: Any, observation: Array, action: Array, config: Config) -> Prediction:
+def predict(params: Any, observation: Array, action: Array, settings: DynamicsSettings) -> Prediction:
     """One member's prediction."""
-    environment, _, _ = config.task()
-    outputs = _network(config).apply(params, features_of(environment.action_space)(observation, action))
-    return _prediction(outputs)
+    features = features_of(settings.action_space)(observation, action)
+    return _prediction(_network(settings).apply(params, features))
 
 
 def _prediction(outputs: Array) -> Prediction:
@@ -69,32 +67,24 @@ def _prediction(outputs: Array) -> Prediction:
     return Prediction(mean=mean, log_sd=MIN_LOG_SD + jax.nn.softplus(log_sd - MIN_LOG_SD))
 
 
-def movement(transition: Transition, environment: peps_envs.Environment, params: Any) -> Array:
-    """What `predict` predicts: how the perceived state moved, in units of sigma_p, (perceived_size,)."""
-    before = environment.perceive_observation(transition.observation, params)
-    after = environment.perceive_observation(transition.next_observation, params)
-    return (after - before) / environment.perception_width(params)
-
-
-def loss(params: Any, transitions: Transition, config: Config) -> Array:
+def loss(params: Any, transitions: Transition, settings: DynamicsSettings) -> Array:
     """One member's mean negative log-likelihood, in nats per transition and up to a constant of the units."""
-    environment, world, _ = config.task()
-    prediction = predict(params, transitions.observation, transitions.action, config)
+    prediction = predict(params, transitions.observation, transitions.action, settings)
+    chex.assert_equal_shape([prediction.mean, transitions.movement])
     density = distrax.MultivariateNormalDiag(prediction.mean, jnp.exp(prediction.log_sd))
-    moved = jax.vmap(movement, in_axes=(0, None, None))(transitions, environment, world)
-    return -jnp.mean(density.log_prob(moved))
+    return -jnp.mean(density.log_prob(transitions.movement))
 
 
 def fit(
-    state: DynamicsState, buffer: Transition, filled: Array, key: Array, config: Config
+    state: DynamicsState, buffer: Transition, filled: Array, key: Array, settings: DynamicsSettings
 ) -> tuple[DynamicsState, dict[str, Array]]:
-    """`config.dynamics_updates` steps of Adam; each member draws minibatches of its own from the `filled` rows."""
-    optimizer = optax.adam(config.dynamics_learning_rate)
-    shape = (config.dynamics_updates, config.ensemble_size, config.batch_size)
+    """`settings.updates` steps of Adam; each member draws minibatches of its own from the `filled` rows of replay."""
+    optimizer = optax.adam(settings.learning_rate)
+    shape = (settings.updates, settings.ensemble_size, settings.batch_size)
     batches = replay.sample(buffer, key, shape, filled)
 
     def update(state: DynamicsState, batch: Transition) -> tuple[DynamicsState, Array]:
-        losses, grads = jax.vmap(jax.value_and_grad(loss), in_axes=(0, 0, None))(state.params, batch, config)
+        losses, grads = jax.vmap(jax.value_and_grad(loss), in_axes=(0, 0, None))(state.params, batch, settings)
         updates, optimizer_state = optimizer.update(grads, state.optimizer)
         return DynamicsState(optax.apply_updates(state.params, updates), optimizer_state), jnp.mean(losses)
 
@@ -102,9 +92,8 @@ def fit(
     return state, {"dynamics_loss": jnp.mean(losses)}
 
 
-def environment_entropy(state: DynamicsState, observation: Array, action: Array, config: Config) -> Array:
+def environment_entropy(state: DynamicsState, observation: Array, action: Array, settings: DynamicsSettings) -> Array:
     """H_T(s, a), (...): the members' mean variance (their disagreement is ignorance, not the domain's randomness)."""
-    environment, _, _ = config.task()
-    features = features_of(environment.action_space)(observation, action)
-    log_sd = _prediction(apply_ensemble(_network(config))(state.params, features)).log_sd
+    features = features_of(settings.action_space)(observation, action)
+    log_sd = _prediction(apply_ensemble(_network(settings))(state.params, features)).log_sd
     return 0.5 * jnp.sum(jnp.log1p(jnp.mean(jnp.exp(2 * log_sd), 0)), -1)

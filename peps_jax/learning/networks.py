@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import linen as nn
 from jax import Array
 
@@ -45,8 +44,8 @@ class Weights(nn.Module):
     @nn.compact
     def __call__(self) -> Layer:
         return Layer(
-            self.param("kernel", self.init, (self.inputs, self.outputs)),
-            self.param("bias", nn.initializers.zeros, (self.outputs,)),
+            self.param("kernel", self.init, (self.inputs, self.outputs), jnp.float32),
+            self.param("bias", nn.initializers.zeros, (self.outputs,), jnp.float32),
         )
 
 
@@ -134,7 +133,7 @@ in_rows.defvjp(_forward, _backward)
 
 def init_ensemble(network: nn.Module, key: Array, members: int, input_size: int) -> Any:
     """Parameters of `members` independent networks, stacked along a leading axis."""
-    return jax.vmap(network.init, in_axes=(0, None))(jax.random.split(key, members), jnp.zeros(input_size))
+    return jax.vmap(network.init, in_axes=(0, None))(jax.random.split(key, members), jnp.zeros(input_size, jnp.float32))
 
 
 def apply_ensemble(network: nn.Module) -> Callable[[Any, Array], Array]:
@@ -147,12 +146,12 @@ def features_of(action_space: peps_envs.ActionSpace) -> Callable[[Array, Array],
 
     def features(observation: Array, action: Array) -> Array:
         if isinstance(action_space, peps_envs.Discrete):
-            action = jax.nn.one_hot(action, action_space.size)
+            action = jax.nn.one_hot(action, action_space.size, dtype=observation.dtype)
         return jnp.concatenate([observation, action], axis=-1)
 
     return features
 
 
-def feature_size(environment: peps_envs.Environment) -> int:
+def feature_size(observation_size: int, action_space: peps_envs.ActionSpace) -> int:
     """Length of `features_of`'s result."""
-    return int(np.sum([environment.observation_size, environment.action_space.size]))
+    return observation_size + action_space.size

@@ -42,7 +42,6 @@ class Head(NamedTuple):
     mode: Callable[[Any], tuple[Array, Array]]  # policy -> action, l_pi
     log_ratio: Callable[[Any, Array], Array]  # (policy, action from elsewhere) -> l_pi
     product: Callable[[Any], Any]  # several policies, stacked -> their normalised product
-    uniform: Callable[[Array], Array]  # key -> action
     critics: Callable[[Any, Any, Array, Array], Array]  # (network, params, observation, action) -> (critics, ...)
     penalty: Callable[[Any], Array]  # policy -> what keeps it where gradients reach it, at least 0
     # (policy, noise, network, params, observation) -> E_pi[min Q], E_pi[l_pi]
@@ -113,7 +112,6 @@ def continuous_head(observation_size: int, action_size: int) -> Head:
         mode=lambda policy: sample(policy, jnp.zeros_like(policy.mean)),
         log_ratio=log_ratio,
         product=product_of_gaussians,
-        uniform=lambda key: jax.random.uniform(key, (action_size,), jnp.float32, minval=-1.0, maxval=1.0),
         critics=critics,
         # where tanh is flat no gradient turns an action back: a policy that leans against a wall would stay there
         penalty=lambda policy: jnp.mean(jnp.sum(policy.mean**2, -1)),
@@ -152,7 +150,6 @@ def discrete_head(observation_size: int, num_actions: int) -> Head:
         mode=lambda logits: sample(logits, jnp.zeros_like(logits)),
         log_ratio=log_ratio,
         product=lambda logits: jnp.sum(jax.nn.log_softmax(logits), 0),
-        uniform=lambda key: jax.random.randint(key, (), 0, num_actions, jnp.int32),
         critics=critics,
         penalty=lambda logits: jnp.zeros((), jnp.float32),
         expect=expect,

@@ -6,31 +6,36 @@ a write stays one slice of the buffer instead of a scatter, and nothing is ever 
 
 from __future__ import annotations
 
+import chex
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-import peps_envs
+from peps_envs import ActionSpace, Discrete
 from peps_jax.trajectory import Transition
 
 
-def init(capacity: int, environment: peps_envs.Environment) -> Transition:
+def init(capacity: int, observation_size: int, action_space: ActionSpace, perceived_size: int) -> Transition:
     """An empty buffer of `capacity` transitions."""
-    discrete = isinstance(environment.action_space, peps_envs.Discrete)
+    numbers = lambda *shape: jnp.zeros((capacity, *shape), jnp.float32)
+    discrete = isinstance(action_space, Discrete)
     return Transition(
-        observation=jnp.zeros((capacity, environment.observation_size)),
-        action=jnp.zeros(capacity, jnp.int32) if discrete else jnp.zeros((capacity, environment.action_space.size)),
-        reward=jnp.zeros(capacity),
-        next_observation=jnp.zeros((capacity, environment.observation_size)),
-        terminated=jnp.zeros(capacity),
+        observation=numbers(observation_size),
+        action=jnp.zeros(capacity, jnp.int32) if discrete else numbers(action_space.size),
+        reward=numbers(),
+        next_observation=numbers(observation_size),
+        movement=numbers(perceived_size),
+        terminated=jnp.zeros(capacity, bool),
     )
 
 
 def add(buffer: Transition, transitions: Transition, position: Array) -> Transition:
     """Writes `transitions` (n, ...) at `position`; the buffer's rows before it are the past."""
-    return jax.tree.map(
-        lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new, position, 0), buffer, transitions
+    chex.assert_trees_all_equal_shapes(
+        *(jax.tree.map(lambda rows: rows[:0], tree) for tree in (buffer, transitions)),  # but for how many there are
     )
+    write = lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new.astype(rows.dtype), position, 0)
+    return jax.tree.map(write, buffer, transitions)
 
 
 def sample(buffer: Transition, key: Array, shape: tuple[int, ...], filled: Array) -> Transition:

@@ -9,188 +9,193 @@ it, so the level has to be pinned: queries with segments of unequal lengths iden
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
 from jax import Array
 
-from peps_jax.config import Config
-from peps_jax.learning import replay
+from peps_jax.config import MOST
 from peps_jax.learning.networks import MLP, apply_ensemble, feature_size, features_of, init_ensemble
-from peps_jax.trajectory import Preferences, Segments, Transition
+from peps_jax.preferences.data import PreferenceSet, Segments
+from peps_jax.settings import SurrogateSettings
 
 VALIDATION_RATIO = (1.1, 1.5)  # bounds on validation loss / training loss that an adapted weight decay aims at
 DECAY_STEP = 1.5  # factor by which a round moves it
 DECAY_BOUNDS = (1e-6, 10.0)
 
 
-class Recipe(NamedTuple):
-    """How r-hat is learned, where methods differ."""
-
-    level: str | None = None  # one of `config.LEVELS`; None: `Config.level`
-    uniform_answers: float = 0.0  # probability, assumed in the likelihood, that the human answers uniformly at random
-    validates: bool = False  # whether weight decay follows the loss on what a member's resample left out
-
-
-PLAIN = Recipe()
-
-
 @struct.dataclass
 class SurrogateState:
-    """The ensemble, what it was taught, and the level."""
+    """The ensemble, and the level of its rewards."""
 
     params: Any  # leading axis: members
     optimizer: Any
-    features: Array  # (capacity, 2, steps, feature_size) of the segments compared so far
-    mask: Array  # (capacity, 2, steps)
-    answers: Array  # (capacity,) P(first preferred)
-    weights: Array  # (capacity, members) how often each member's resample holds the preference
-    answered: Array  # (capacity,) 1.0 where the teacher answered
+    bootstrap: Array  # (2,) data of the random key that decides the members' resamples
     decay: Array  # () weight decay of the fit
     shift: Array  # (members,) subtracted from each member's rewards
     scale: Array  # (members,) divides them
 
 
-def _network(config: Config) -> MLP:
-    return MLP(config.model_hidden_sizes, 1, output_scale=0.1)
+class Examples(NamedTuple):
+    """Preferences as the fit sees them."""
+
+    features: Array  # (n, 2, steps, feature_size) of the segments
+    mask: Array  # (n, 2, steps) bool
+    preferred: Array  # (n,) P(first preferred)
+    weights: Array  # (n, members) how much each member's resample makes of each
 
 
-def _optimizer(config: Config, decay: Array) -> optax.GradientTransformation:
-    return optax.adamw(config.surrogate_learning_rate, weight_decay=decay)
+def _network(settings: SurrogateSettings) -> MLP:
+    return MLP(settings.hidden_sizes, 1, output_scale=0.1)
 
 
-def init(key: Array, config: Config) -> SurrogateState:
-    """An untrained ensemble without preferences."""
-    environment, _, _ = config.task()
-    size, steps = feature_size(environment), config.segment_length
-    capacity = config.queries_per_round * config.num_rounds
-    params = init_ensemble(_network(config), key, config.ensemble_size, size)
-    decay = jnp.asarray(config.surrogate_decay, jnp.float32)
+def _optimizer(settings: SurrogateSettings, decay: Array) -> optax.GradientTransformation:
+    return optax.adamw(settings.learning_rate, weight_decay=decay)
+
+
+def init(key: Array, settings: SurrogateSettings) -> SurrogateState:
+    """An untrained ensemble."""
+    size = feature_size(settings.observation_size, settings.action_space)
+    params = init_ensemble(_network(settings), key, settings.ensemble_size, size)
+    decay = jnp.asarray(settings.decay, jnp.float32)
     return SurrogateState(
         params=params,
-        optimizer=_optimizer(config, decay).init(params),
-        features=jnp.zeros((capacity, 2, steps, size)),
-        mask=jnp.zeros((capacity, 2, steps)),
-        answers=jnp.zeros(capacity),
-        weights=jnp.zeros((capacity, config.ensemble_size)),
-        answered=jnp.zeros(capacity),
+        optimizer=_optimizer(settings, decay).init(params),
+        bootstrap=jax.random.key_data(jax.random.fold_in(key, 1)),
         decay=decay,
-        shift=jnp.zeros(config.ensemble_size),
-        scale=jnp.ones(config.ensemble_size),
+        shift=jnp.zeros(settings.ensemble_size, jnp.float32),
+        scale=jnp.ones(settings.ensemble_size, jnp.float32),
     )
 
 
-def add(state: SurrogateState, preferences: Preferences, position: Array, key: Array, config: Config) -> SurrogateState:
-    """Writes `preferences` at `position`. A member's resample holds each one Poisson(1) times, as a bootstrap would."""
-    environment, _, _ = config.task()
-    segments = preferences.segments
-    number = preferences.answers.shape[0]
-    asked = jnp.arange(number) + position < config.num_queries  # the last round may ask more than the budget has left
-    copies = jax.random.poisson(key, 1.0, (number, config.ensemble_size)).astype(jnp.float32)
-    answered = preferences.answered * asked
-    write = lambda rows, new: jax.lax.dynamic_update_slice_in_dim(rows, new, position, 0)
-    return state.replace(
-        features=write(state.features, features_of(environment.action_space)(segments.observation, segments.action)),
-        mask=write(state.mask, segments.mask),
-        answers=write(state.answers, preferences.answers),
-        weights=write(state.weights, copies * answered[:, None]),
-        answered=write(state.answered, answered),
+# --- preferences ----------------------------------------------------------------------------------------------------------
+
+# P(at most k) of a Poisson distribution of mean 1, k = 0, 1, ...; beyond the last lies less than 1e-7
+_POISSON = np.cumsum([math.exp(-1) / math.factorial(count) for count in range(10)]).astype(np.float32)
+
+
+def resampled(bootstrap: Array, number: Array, members: int) -> Array:
+    """How often each member's resample holds the queries called `number` (n,): (n, members), Poisson(1) as in a bootstrap.
+
+    It follows from a query's identity alone, whenever and in whatever order answers come.
+    """
+    key = jax.random.wrap_key_data(bootstrap)
+    draw = lambda number: jax.random.uniform(jax.random.fold_in(key, number), (members,), jnp.float32)
+    uniform = jax.vmap(draw)(number)
+    return jnp.sum(uniform[..., None] > jnp.asarray(_POISSON)[None, None], -1).astype(jnp.float32)
+
+
+def _examples(state: SurrogateState, preferences: PreferenceSet, settings: SurrogateSettings) -> Examples:
+    """All preferences as examples; those that nobody has answered weigh nothing."""
+    copies = resampled(state.bootstrap, preferences.number, settings.ensemble_size)
+    return Examples(
+        features=features_of(settings.action_space)(preferences.observation, preferences.action),
+        mask=preferences.mask,
+        preferred=preferences.preferred,
+        weights=copies * preferences.weight[:, None],
     )
 
 
-def segment_sums(params: Any, features: Array, mask: Array, config: Config) -> Array:
+def _minibatches(key: Array, preferences: PreferenceSet, settings: SurrogateSettings) -> PreferenceSet:
+    """(updates, batch_size) of the answered preferences, drawn uniformly.
+
+    They are drawn in the order of their numbers, so that it makes no difference in which order they came.
+    """
+    there = preferences.weight > 0
+    order = jnp.argsort(jnp.where(there, preferences.number, MOST))
+    shape = (settings.updates, settings.batch_size)
+    drawn = jax.random.randint(key, shape, 0, jnp.maximum(jnp.sum(there, dtype=jnp.int32), 1), jnp.int32)
+    return jax.tree.map(lambda rows: rows[order[drawn]], preferences)
+
+
+# --- likelihood -----------------------------------------------------------------------------------------------------------
+
+
+def segment_sums(params: Any, features: Array, mask: Array, settings: SurrogateSettings) -> Array:
     """sum_t r_hat over segments, by every member: (members, ...) from features (..., steps, n) and mask (..., steps)."""
-    rewards = apply_ensemble(_network(config))(params, features)[..., 0]
-    return jnp.sum(rewards * mask[None], -1)
+    chex.assert_equal_shape_prefix([features, mask], mask.ndim)
+    rewards = apply_ensemble(_network(settings))(params, features)[..., 0]
+    return jnp.sum(jnp.where(mask[None], rewards, 0.0), -1)
 
 
-def answer_logits(difference: Array, recipe: Recipe) -> Array:
+def answer_logits(difference: Array, uniform_answers: float) -> Array:
     """log P / (1 - P) of the first segment being preferred, from r_hat's sum over the first less that over the second.
 
-    P = u / 2 + (1 - u) sigmoid(difference), with u the recipe's `uniform_answers` (Christiano et al. 2017, Sec. 2.2.3): an error
-    costs at most log(u / 2), however large the difference.
+    P = u / 2 + (1 - u) sigmoid(difference), u the share of answers that are taken for random (Christiano et al. 2017,
+    Sec. 2.2.3): an error costs at most log(u / 2), however large the difference.
     """
-    if not recipe.uniform_answers:
+    if not uniform_answers:
         return difference
-    random, considered = jnp.log(recipe.uniform_answers / 2), jnp.log1p(-recipe.uniform_answers)
+    random, considered = math.log(uniform_answers / 2), math.log1p(-uniform_answers)
     log_probability = lambda difference: jnp.logaddexp(random, considered + jax.nn.log_sigmoid(difference))
     return log_probability(difference) - log_probability(-difference)
 
 
-def preference_logits(state: SurrogateState, segments: Segments, config: Config, recipe: Recipe = PLAIN) -> Array:
+def preference_logits(state: SurrogateState, segments: Segments, settings: SurrogateSettings) -> Array:
     """log P / (1 - P) of the first segment being preferred, by every member: (members, n) from pairs (n, 2, steps, ...)."""
-    environment, _, _ = config.task()
-    features = features_of(environment.action_space)(segments.observation, segments.action)
-    sums = segment_sums(state.params, features, segments.mask, config)
-    return answer_logits(sums[..., 0] - sums[..., 1], recipe)
+    features = features_of(settings.action_space)(segments.observation, segments.action)
+    sums = segment_sums(state.params, features, segments.mask, settings)
+    return answer_logits(sums[..., 0] - sums[..., 1], settings.uniform_answers)
 
 
-def loss(
-    params: Any,
-    features: Array,
-    mask: Array,
-    answers: Array,
-    weights: Array,
-    config: Config,
-    recipe: Recipe = PLAIN,
-) -> tuple[Array, Array]:
-    """Bradley-Terry cross-entropy of all members over queries (n, 2, steps, ...), and their accuracy; log 2 at a tie.
-
-    `weights` (n, members) is how often each member sees each query.
-    """
-    sums = segment_sums(params, features, mask, config)
+def loss(params: Any, examples: Examples, settings: SurrogateSettings) -> tuple[Array, Array]:
+    """Bradley-Terry cross-entropy of all members over their examples, and their accuracy; log 2 at a tie."""
+    chex.assert_equal_shape_prefix(list(examples), 1)
+    sums = segment_sums(params, examples.features, examples.mask, settings)
     # (members, n); logits, because exp overflows on long segments
-    logits = answer_logits(sums[..., 0] - sums[..., 1], recipe)
-    cross_entropy = optax.sigmoid_binary_cross_entropy(logits, answers[None])
+    logits = answer_logits(sums[..., 0] - sums[..., 1], settings.uniform_answers)
+    preferred, weights = examples.preferred[None], examples.weights.T
+    cross_entropy = optax.sigmoid_binary_cross_entropy(logits, preferred)
     total = jnp.maximum(jnp.sum(weights), 1.0)
-    decided = weights.T * (answers != 0.5)[None]
-    correct = jnp.sum(decided * ((logits > 0) == (answers > 0.5)[None])) / jnp.maximum(jnp.sum(decided), 1.0)
-    return jnp.sum(weights.T * cross_entropy) / total, correct
+    decided = jnp.where(preferred != 0.5, weights, 0.0)
+    right = (logits > 0) == (preferred > 0.5)
+    correct = jnp.sum(jnp.where(right, decided, 0.0)) / jnp.maximum(jnp.sum(decided), 1.0)
+    return jnp.sum(weights * cross_entropy) / total, correct
+
+
+# --- the fit --------------------------------------------------------------------------------------------------------------
 
 
 def fit(
-    state: SurrogateState,
-    buffer: Transition,
-    known: Array,
-    filled: Array,
-    key: Array,
-    config: Config,
-    recipe: Recipe = PLAIN,
+    state: SurrogateState, preferences: PreferenceSet, key: Array, settings: SurrogateSettings
 ) -> tuple[SurrogateState, dict[str, Array]]:
-    """`config.surrogate_updates` steps of AdamW on the first `known` preferences, then the level over replay."""
-    optimizer = _optimizer(config, state.decay)
-    key_batch, key_level = jax.random.split(key)
-    index = jax.random.randint(key_batch, (config.surrogate_updates, config.surrogate_batch_size), 0, known)
+    """`settings.updates` steps of AdamW on what was answered. Preferences of weight 0 weigh nothing."""
+    optimizer = _optimizer(settings, state.decay)
 
-    def update(carry: tuple[Any, Any], index: Array) -> tuple[tuple[Any, Any], tuple[Array, Array]]:
+    def update(carry: tuple[Any, Any], rows: PreferenceSet) -> tuple[tuple[Any, Any], tuple[Array, Array]]:
         params, optimizer_state = carry
-        rows = (state.features[index], state.mask[index], state.answers[index], state.weights[index])
-        info, grads = jax.value_and_grad(loss, has_aux=True)(params, *rows, config, recipe)
+        examples = _examples(state, rows, settings)
+        info, grads = jax.value_and_grad(loss, has_aux=True)(params, examples, settings)
         updates, optimizer_state = optimizer.update(grads, optimizer_state, params)
         return (optax.apply_updates(params, updates), optimizer_state), info
 
-    (params, optimizer_state), (losses, correct) = jax.lax.scan(update, (state.params, state.optimizer), index)
+    minibatches = _minibatches(key, preferences, settings)
+    (params, optimizer_state), (losses, correct) = jax.lax.scan(update, (state.params, state.optimizer), minibatches)
     state = state.replace(params=params, optimizer=optimizer_state)
     info = {"surrogate_loss": jnp.mean(losses), "preference_accuracy": jnp.mean(correct)}
-    if recipe.validates:
-        state, validated = _adapt(state, config, recipe)
+    if settings.validates:
+        state, validated = _adapt(state, preferences, settings)
         info |= validated
-    visited = replay.sample(buffer, key_level, (1024,), filled)
-    return _pin(state, visited, config.level if recipe.level is None else recipe.level, config), info
+    return state, info
 
 
-def _adapt(state: SurrogateState, config: Config, recipe: Recipe) -> tuple[SurrogateState, dict[str, Array]]:
+def _adapt(
+    state: SurrogateState, preferences: PreferenceSet, settings: SurrogateSettings
+) -> tuple[SurrogateState, dict[str, Array]]:
     """Moves the weight decay up where validation loss / training loss is above `VALIDATION_RATIO`, down where it is below.
 
     A member is validated on the answers that its resample holds 0 times: 1/e of them (Christiano et al. 2017, Sec. 2.2.3).
     """
-    held_out = (state.weights == 0) * state.answered[:, None]
-    both = jnp.stack([state.weights, held_out])
-    over = jax.vmap(loss, in_axes=(None, None, None, None, 0, None, None))
-    (training, validation), _ = over(state.params, state.features, state.mask, state.answers, both, config, recipe)
+    examples = _examples(state, preferences, settings)
+    held_out = jnp.where(examples.weights == 0, preferences.weight[:, None], 0.0)
+    over = jax.vmap(lambda weights: loss(state.params, examples._replace(weights=weights), settings)[0])
+    training, validation = over(jnp.stack([examples.weights, held_out]))
     low, high = VALIDATION_RATIO
     ratio = validation / jnp.maximum(training, 1e-6)
     factor = jnp.where(ratio > high, DECAY_STEP, jnp.where(ratio < low, 1 / DECAY_STEP, 1.0))
@@ -199,33 +204,35 @@ def _adapt(state: SurrogateState, config: Config, recipe: Recipe) -> tuple[Surro
     return state.replace(decay=decay), info
 
 
-def _pin(state: SurrogateState, visited: Transition, level: str, config: Config) -> SurrogateState:
-    """Sets shift and scale from what r-hat says of `visited` transitions.
+# --- the reward -----------------------------------------------------------------------------------------------------------
+
+
+def pin(state: SurrogateState, observation: Array, action: Array, settings: SurrogateSettings) -> SurrogateState:
+    """Sets shift and scale from what r-hat says of (s, a) that were visited, (n, ...).
 
     "quantile" puts the ensemble's 0.95 quantile at 0 and its 0.05 quantile at -1, "max" its maximum at 0, "standard" every
     member's mean at 0 and its standard deviation at 1 (Christiano et al. 2017, Sec. 2.2.3); "none" takes r-hat as it is.
     """
-    raw = member_rewards(state, visited.observation, visited.action, config)
+    raw = member_rewards(state, observation, action, settings)
     everyone = lambda value: jnp.broadcast_to(value, state.shift.shape)
-    if level == "max":
+    if settings.level == "max":
         return state.replace(shift=everyone(jnp.max(jnp.mean(raw, 0))))
-    if level == "quantile":
-        low, high = jnp.quantile(jnp.mean(raw, 0), jnp.array([0.05, 0.95]))
+    if settings.level == "quantile":
+        low, high = jnp.quantile(jnp.mean(raw, 0), jnp.array([0.05, 0.95], jnp.float32))
         return state.replace(shift=everyone(high), scale=everyone(jnp.maximum(high - low, 1e-3)))
-    if level == "standard":
+    if settings.level == "standard":
         return state.replace(shift=jnp.mean(raw, -1), scale=jnp.maximum(jnp.std(raw, -1), 1e-3))
     return state
 
 
-def member_rewards(state: SurrogateState, observation: Array, action: Array, config: Config) -> Array:
+def member_rewards(state: SurrogateState, observation: Array, action: Array, settings: SurrogateSettings) -> Array:
     """Each member's r_hat(s, a) before its level is set, (members, ...)."""
-    environment, _, _ = config.task()
-    features = features_of(environment.action_space)(observation, action)
-    return apply_ensemble(_network(config))(state.params, features)[..., 0]
+    features = features_of(settings.action_space)(observation, action)
+    return apply_ensemble(_network(settings))(state.params, features)[..., 0]
 
 
-def predict(state: SurrogateState, observation: Array, action: Array, config: Config) -> Array:
+def predict(state: SurrogateState, observation: Array, action: Array, settings: SurrogateSettings) -> Array:
     """r_hat(s, a), (...): the mean of the members at their levels."""
-    rewards = member_rewards(state, observation, action, config)
+    rewards = member_rewards(state, observation, action, settings)
     levelled = jax.vmap(lambda rewards, shift, scale: (rewards - shift) / scale)(rewards, state.shift, state.scale)
     return jnp.mean(levelled, 0)

@@ -1,20 +1,20 @@
 """DRLHP (Christiano et al. 2017): SAC on r-hat alone, as if the human's answers were about the task.
 
-The teacher, the budget and the choice of queries are PEPS's. That paper's own (Sec. 2.2.1 and 2.2.3): every member of the
-ensemble is normalised by itself, to mean 0 and a fixed standard deviation over what was visited; a share 1/e of the answers,
-what a member's resample leaves out, validates it and moves its weight decay; and 10 % of the answers count as random. Its
-normalisation leaves no level to r-hat: it was made for tasks without an end. `DRLHP_UNSCALED` leaves the normalisation out, so
-that r-hat keeps the level and the scale that the answers give it.
+The teacher, the budget and the choice of queries are PEPS's. That paper's own (Sec. 2.2.1 and 2.2.3): a share 1/e of the
+answers, what a member's resample leaves out, validates it and moves its weight decay; and 10 % of the answers count as random.
+Its normalisation of every member to mean 0 and standard deviation 1 over what was visited is `level="standard"`. It leaves no
+level to r-hat: it was made for tasks without an end, and pays here for staying alive.
 """
 
 from __future__ import annotations
 
-from peps_jax.learning.surrogate import Recipe
-from peps_jax.methods import preference_based
+from peps_jax.methods.preference_based import PREFERENCE_BASED
+from peps_jax.settings import Settings
 
-RECIPE = Recipe(level="standard", uniform_answers=0.1, validates=True)
 
-DRLHP = preference_based.method("drlhp", rewards=(preference_based.reward,), recipe=RECIPE)
-DRLHP_UNSCALED = preference_based.method(
-    "drlhp_unscaled", rewards=(preference_based.reward,), recipe=RECIPE._replace(level="none")
-)
+def own_way(settings: Settings) -> Settings:
+    """The paper's own likelihood and regularisation."""
+    return settings.replace(surrogate=settings.surrogate.replace(uniform_answers=0.1, validates=True))
+
+
+DRLHP = PREFERENCE_BASED._replace(name="drlhp", settings=own_way)

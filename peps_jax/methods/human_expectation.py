@@ -8,4 +8,6 @@ from __future__ import annotations
 
 from peps_jax.methods.sac import SAC
 
-HUMAN_EXPECTATION = SAC._replace(name="human_expectation", world=lambda params, belief: belief)
+HUMAN_EXPECTATION = SAC._replace(
+    name="human_expectation", acts_in=lambda problem: problem.replace(params=problem.belief)
+)

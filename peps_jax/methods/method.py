@@ -7,31 +7,44 @@ from typing import Any, NamedTuple
 
 from jax import Array
 
-from peps_jax.config import Config
-from peps_jax.trajectory import Preferences, Segments, Trajectory, Transition
+from peps_jax.config import Problem
+from peps_jax.learning import sac
+from peps_jax.learning.surrogate import SurrogateState
+from peps_jax.preferences.data import PreferenceSet, Segments
+from peps_jax.round import Round
+from peps_jax.settings import AgentSettings, Settings
+from peps_jax.trajectory import Trajectory, Transition
+
+
+def each_acts(agents: tuple[sac.Agent, ...], observation: Array, key: Array, settings: AgentSettings) -> Array:
+    """Actions (num_envs, ...) of the acting policy, in every environment."""
+    return sac.act(agents, observation, key, settings)[0]
 
 
 class Method(NamedTuple):
-    """What is learned in a round, which rewards SAC sees, and in which world.
+    """What makes a method different: what it learns in a round, which rewards SAC sees, how it behaves, and in which domain.
 
-    `knowledge` is whatever the method learns beside the policy (T_A, r-hat, ...), a pytree.
+    `knowledge` is whatever the method learns beside the policy (T_A, r-hat, ...), a pytree. The defaults are those of a method
+    that learns nothing beside, asks nothing, and acts in the true domain: SAC.
     """
 
     name: str
-    uses_lam: bool  # whether lambda changes anything: a sweep trains a method without it once
-    # (true parameters, belief) -> parameters of the world that it acts in, for learning and for evaluation
-    world: Callable[[Any, Any], Any]
-    init: Callable[[Array, Config], Any]  # (key, config) -> knowledge
-    # (knowledge, trajectory, key, config) -> queries (n, 2, steps, ...), or None from a method that asks nothing
-    ask: Callable[[Any, Trajectory, Array, Config], Segments | None]
-    # (knowledge, replay, filled rows, preferences or None, round index, key, config) -> knowledge, info
-    learn: Callable[[Any, Transition, Array, Preferences | None, Array, Array, Config], tuple[Any, dict[str, Array]]]
-    # (knowledge, transitions, config) -> rewards, in reward units. One policy is learned for each, and they act by their product
-    rewards: tuple[Callable[[Any, Transition, Config], Array], ...]
-    entropy_weight: Callable[[Config], Array]  # of the policy entropy beside SAC's own temperature, in reward units
-
-
-def true_world(params: Any, belief: Any) -> Any:
-    """The world of every method that acts in the true dynamics."""
-    del belief
-    return params
+    # (knowledge, transitions, settings) -> rewards, in reward units. One policy is learned for each, and they act by their product
+    rewards: tuple[Callable[[Any, Transition, Settings], Array], ...]
+    uses_lam: bool = False  # whether lambda changes anything: a sweep trains a method without it once
+    asks: bool = False  # whether it asks a teacher
+    acts_in: Callable[[Problem], Problem] = lambda problem: problem  # for learning and for evaluation
+    settings: Callable[[Settings], Settings] = lambda settings: settings  # what the method has its own way
+    init: Callable[[Array, Settings], Any] = lambda key, settings: ()  # (key, settings) -> knowledge
+    # (knowledge, trajectory, key, settings) -> pairs of segments (n, 2, steps, ...) for the teacher; called if it asks
+    ask: Callable[[Any, Trajectory, Array, Settings], Segments] | None = None
+    # (knowledge, replay, preferences known by now, round, settings) -> knowledge, info
+    learn: Callable[[Any, Transition, PreferenceSet | None, Round, Settings], tuple[Any, dict[str, Array]]] = (
+        lambda knowledge, replay, preferences, now, settings: (knowledge, {})
+    )
+    # of the policy entropy beside SAC's own temperature, in reward units
+    entropy_weight: Callable[[Settings], Array | float] = lambda settings: 0.0
+    # (agents, observations (num_envs, ...), key, settings) -> actions (num_envs, ...) while it learns
+    behave: Callable[[tuple[sac.Agent, ...], Array, Array, AgentSettings], Array] = each_acts
+    # knowledge -> r-hat; None of a method that learns none
+    surrogate: Callable[[Any], SurrogateState | None] = lambda knowledge: None

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
 import jax
-import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from peps_jax.config import Config
 from peps_jax.learning import dynamics, surrogate
 from peps_jax.methods import preference_based
-from peps_jax.methods.method import Method, true_world
-from peps_jax.trajectory import Preferences, Transition
+from peps_jax.methods.preference_based import PREFERENCE_BASED
+from peps_jax.preferences.data import PreferenceSet
+from peps_jax.round import Round
+from peps_jax.settings import Settings
+from peps_jax.trajectory import Transition
 
 
 @struct.dataclass
@@ -24,62 +23,48 @@ class Knowledge:
     surrogate: surrogate.SurrogateState  # r_hat
 
 
-def init(key: Array, config: Config) -> Knowledge:
+def init(key: Array, settings: Settings) -> Knowledge:
+    """Untrained T_A and r-hat."""
     key_dynamics, key_surrogate = jax.random.split(key)
-    return Knowledge(dynamics=dynamics.init(key_dynamics, config), surrogate=surrogate.init(key_surrogate, config))
+    return Knowledge(
+        dynamics=dynamics.init(key_dynamics, settings.dynamics),
+        surrogate=surrogate.init(key_surrogate, settings.surrogate),
+    )
 
 
 def learn(
-    knowledge: Knowledge,
-    buffer: Transition,
-    filled: Array,
-    preferences: Preferences,
-    index: Array,
-    key: Array,
-    config: Config,
+    knowledge: Knowledge, buffer: Transition, preferences: PreferenceSet, now: Round, settings: Settings
 ) -> tuple[Knowledge, dict[str, Array]]:
     """Lines 4-8 of Algorithm 1: T_A from replay, r_hat from the preferences given so far."""
-    key_dynamics, *keys = jax.random.split(key, 3)
-    dynamics_state, dynamics_info = dynamics.fit(knowledge.dynamics, buffer, filled, key_dynamics, config)
-    surrogate_state, surrogate_info = preference_based.learn(
-        knowledge.surrogate, buffer, filled, preferences, index, tuple(keys), config
+    key_dynamics, _, key_surrogate = jax.random.split(now.keys.learn, 3)
+    dynamics_state, dynamics_info = dynamics.fit(
+        knowledge.dynamics, buffer, now.filled, key_dynamics, settings.dynamics
+    )
+    surrogate_state, surrogate_info = preference_based.fit_surrogate(
+        knowledge.surrogate, buffer, preferences, now.filled, key_surrogate, settings
     )
     return Knowledge(dynamics=dynamics_state, surrogate=surrogate_state), dynamics_info | surrogate_info
 
 
-def reward(knowledge: Knowledge, transitions: Transition, config: Config) -> Array:
+def reward(knowledge: Knowledge, transitions: Transition, settings: Settings) -> Array:
     """Eq. (6) without its policy entropy, which is SAC's own: r_A + lambda (r_hat + H_T)."""
-    observation, action = transitions.observation, transitions.action
-    preferred = surrogate.predict(knowledge.surrogate, observation, action, config)
-    entropy = dynamics.environment_entropy(knowledge.dynamics, observation, action, config)
-    explicable = config.surrogate_weight * preferred + config.environment_entropy_weight * entropy
-    return transitions.reward + config.lam * explicable
+    observation, action, objective = transitions.observation, transitions.action, settings.objective
+    preferred = surrogate.predict(knowledge.surrogate, observation, action, settings.surrogate)
+    entropy = dynamics.environment_entropy(knowledge.dynamics, observation, action, settings.dynamics)
+    explicable = (
+        objective.surrogate_weight * preferred
+        + objective.environment_entropy_weight * entropy
+        + objective.entropy_offset
+    )
+    return transitions.reward + objective.lam * explicable
 
 
-PEPS = Method(
+PEPS = PREFERENCE_BASED._replace(
     name="peps",
-    uses_lam=True,
-    world=true_world,
-    init=init,
-    ask=lambda knowledge, trajectory, key, config: preference_based.ask(knowledge.surrogate, trajectory, key, config),
-    learn=learn,
     rewards=(reward,),
+    uses_lam=True,
+    init=init,
+    learn=learn,
     # SAC's own temperature explores; Eq. (6)'s comes on top, so that at lambda = 0 PEPS is SAC
-    entropy_weight=lambda config: config.lam * config.policy_entropy_weight,
+    entropy_weight=lambda settings: settings.objective.lam * settings.objective.policy_entropy_weight,
 )
-
-
-def absolute_reward(knowledge: Knowledge, transitions: Transition, config: Config) -> Array:
-    """`reward` with Eq. (6)'s entropies as they are defined, and not against the perceptual kernel and the uniform policy.
-
-    They are more by a constant per step, H of the kernel, n/2 log(2 pi e) + sum_i log sigma_p,i, and H of the uniform policy.
-    """
-    environment, params, _ = config.task()
-    width = environment.perception_width(params)
-    kernel = 0.5 * width.shape[0] * math.log(2 * math.pi * math.e) + jnp.sum(jnp.log(width))
-    uniform = environment.action_space.uniform_entropy
-    constant = config.environment_entropy_weight * kernel + config.policy_entropy_weight * uniform
-    return reward(knowledge, transitions, config) + config.lam * constant
-
-
-PEPS_ABSOLUTE = PEPS._replace(name="peps_absolute", rewards=(absolute_reward,))  # an ablation

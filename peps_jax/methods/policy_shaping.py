@@ -3,18 +3,37 @@
     pi(a|s) ~ pi_A(a|s) pi_H(a|s),
 
 normalised over discrete actions; for continuous ones it is the product of the Gaussians before tanh, whose mean is weighed by
-their precisions. Feedback is PEPS's r-hat, from the same teacher and budget: the two differ in what they make of it. While they
-learn, the product acts in a third of the environments and each policy alone in another third (`train.collect_and_ask`): where
-only the product acted, the policies' own mistakes were never carried out, and so never corrected.
+their precisions. Feedback is PEPS's r-hat, from the same teacher and budget: the two differ in what they make of it.
 
 Two policies that are sure of opposite actions make one that is sure of neither: (0.1, 0.9) and (0.9, 0.1) give (0.5, 0.5).
 """
 
 from __future__ import annotations
 
-from peps_jax.methods import preference_based
+import jax.numpy as jnp
+from jax import Array
 
-POLICY_SHAPING = preference_based.method(
-    "policy_shaping",
-    rewards=(lambda knowledge, transitions, config: transitions.reward, preference_based.reward),
+from peps_jax.learning import sac
+from peps_jax.methods import preference_based
+from peps_jax.methods.preference_based import PREFERENCE_BASED
+from peps_jax.settings import AgentSettings
+
+
+def act_in_thirds(agents: tuple[sac.Agent, ...], observation: Array, key: Array, settings: AgentSettings) -> Array:
+    """The product acts in a third of the environments, and each policy alone in another third.
+
+    SAC goes astray with a policy whose actions it never sees carried out: where only the product acted, the policies' own
+    mistakes were never corrected.
+    """
+    teams = [agents, *((agent,) for agent in agents)]
+    keys = sac.agent_keys(key, len(teams))
+    actions = [sac.act(team, observation, key, settings)[0] for team, key in zip(teams, keys, strict=True)]
+    env = jnp.arange(observation.shape[0])
+    return jnp.stack(actions, 1)[env, env % len(teams)]
+
+
+POLICY_SHAPING = PREFERENCE_BASED._replace(
+    name="policy_shaping",
+    rewards=(lambda knowledge, transitions, settings: transitions.reward, preference_based.reward),
+    behave=act_in_thirds,
 )

@@ -1,19 +1,21 @@
-"""What methods that ask a human have in common: how they ask, and how they learn r-hat from the answers."""
+"""What methods that ask a teacher have in common: how they ask, and how they learn r-hat from the answers."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import jax
 from flax import struct
 from jax import Array
 
-from peps_jax.config import Config
-from peps_jax.learning import surrogate
-from peps_jax.learning.surrogate import PLAIN, Recipe, SurrogateState
-from peps_jax.methods.method import Method, true_world
+from peps_jax.learning import replay, surrogate
+from peps_jax.learning.surrogate import SurrogateState
+from peps_jax.methods.method import Method
 from peps_jax.preferences import queries
-from peps_jax.trajectory import Preferences, Segments, Trajectory, Transition
+from peps_jax.preferences.data import PreferenceSet, Segments
+from peps_jax.round import Round
+from peps_jax.settings import Settings
+from peps_jax.trajectory import Trajectory, Transition
+
+LEVELLED_ON = 1024  # transitions of replay on which r-hat's level is set
 
 
 @struct.dataclass
@@ -23,54 +25,51 @@ class Knowledge:
     surrogate: SurrogateState  # r_hat
 
 
-def ask(state: SurrogateState, trajectory: Trajectory, key: Array, config: Config, recipe: Recipe = PLAIN) -> Segments:
+def init(key: Array, settings: Settings) -> Knowledge:
+    """An untrained r-hat."""
+    return Knowledge(surrogate=surrogate.init(key, settings.surrogate))
+
+
+def ask(knowledge: Knowledge, trajectory: Trajectory, key: Array, settings: Settings) -> Segments:
     """The queries of this round: of the latest trajectories' pairs, those from which the ensemble learns most."""
     key_candidates, key_choose = jax.random.split(key)
-    pairs = queries.candidates(trajectory, key_candidates, config)
-    logits = surrogate.preference_logits(state, pairs, config, recipe)
-    chosen = queries.choose(logits, queries.describe(pairs), key_choose, config)
+    pairs = queries.candidates(trajectory, key_candidates, settings.queries)
+    logits = surrogate.preference_logits(knowledge.surrogate, pairs, settings.surrogate)
+    chosen = queries.choose(logits, queries.describe(pairs), key_choose, settings.queries)
     return jax.tree.map(lambda rows: rows[chosen], pairs)
 
 
-def learn(
-    state: SurrogateState,
-    buffer: Transition,
-    filled: Array,
-    preferences: Preferences,
-    index: Array,
-    keys: tuple[Array, Array],
-    config: Config,
-    recipe: Recipe = PLAIN,
+def fit_surrogate(
+    state: SurrogateState, buffer: Transition, preferences: PreferenceSet, filled: Array, key: Array, settings: Settings
 ) -> tuple[SurrogateState, dict[str, Array]]:
-    """r-hat from the preferences given so far, of which round `index` brings the last; `keys` to resample and to fit."""
-    key_add, key_fit = keys
-    position = index * config.queries_per_round
-    taught = surrogate.add(state, preferences, position, key_add, config)
-    return surrogate.fit(taught, buffer, position + config.queries_per_round, filled, key_fit, config, recipe)
+    """r-hat from the preferences that are known, and its level over what was visited."""
+    key_fit, key_level = jax.random.split(key)
+    state, info = surrogate.fit(state, preferences, key_fit, settings.surrogate)
+    visited = replay.sample(buffer, key_level, (LEVELLED_ON,), filled)
+    return surrogate.pin(state, visited.observation, visited.action, settings.surrogate), info
 
 
-def reward(knowledge: Knowledge, transitions: Transition, config: Config) -> Array:
+def learn(
+    knowledge: Knowledge, buffer: Transition, preferences: PreferenceSet, now: Round, settings: Settings
+) -> tuple[Knowledge, dict[str, Array]]:
+    """Learns r-hat alone."""
+    _, key = jax.random.split(now.keys.learn)
+    state, info = fit_surrogate(knowledge.surrogate, buffer, preferences, now.filled, key, settings)
+    return Knowledge(surrogate=state), info
+
+
+def reward(knowledge: Knowledge, transitions: Transition, settings: Settings) -> Array:
     """r_hat(s, a)."""
-    return surrogate.predict(knowledge.surrogate, transitions.observation, transitions.action, config)
+    return surrogate.predict(knowledge.surrogate, transitions.observation, transitions.action, settings.surrogate)
 
 
-def method(
-    name: str, rewards: tuple[Callable[[Knowledge, Transition, Config], Array], ...], recipe: Recipe = PLAIN
-) -> Method:
-    """The method `name`, which learns r-hat by `recipe`, and a policy for each of `rewards` at SAC's own temperature."""
-
-    def learn_surrogate(knowledge, buffer, filled, preferences, index, key, config):
-        keys = tuple(jax.random.split(key))
-        state, info = learn(knowledge.surrogate, buffer, filled, preferences, index, keys, config, recipe)
-        return Knowledge(surrogate=state), info
-
-    return Method(
-        name=name,
-        uses_lam=False,
-        world=true_world,
-        init=lambda key, config: Knowledge(surrogate=surrogate.init(key, config)),
-        ask=lambda knowledge, trajectory, key, config: ask(knowledge.surrogate, trajectory, key, config, recipe),
-        learn=learn_surrogate,
-        rewards=rewards,
-        entropy_weight=lambda config: 0.0,
-    )
+# SAC on r-hat alone
+PREFERENCE_BASED = Method(
+    name="preference_based",
+    rewards=(reward,),
+    asks=True,
+    init=init,
+    ask=ask,
+    learn=learn,
+    surrogate=lambda knowledge: knowledge.surrogate,
+)

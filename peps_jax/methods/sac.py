@@ -2,15 +2,6 @@
 
 from __future__ import annotations
 
-from peps_jax.methods.method import Method, true_world
+from peps_jax.methods.method import Method
 
-SAC = Method(
-    name="sac",
-    uses_lam=False,
-    world=true_world,
-    init=lambda key, config: (),
-    ask=lambda knowledge, trajectory, key, config: None,
-    learn=lambda knowledge, buffer, filled, preferences, index, key, config: (knowledge, {}),
-    rewards=(lambda knowledge, transitions, config: transitions.reward,),
-    entropy_weight=lambda config: 0.0,
-)
+SAC = Method(name="sac", rewards=(lambda knowledge, transitions, settings: transitions.reward,))

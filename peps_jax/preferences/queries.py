@@ -10,34 +10,38 @@ between the answer and the ensemble's members (Biyik et al. 2019),
 
 from __future__ import annotations
 
+import chex
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from peps_jax.config import Config
-from peps_jax.trajectory import Segments, Trajectory
+from peps_jax.preferences.data import Segments
+from peps_jax.settings import QuerySettings
+from peps_jax.trajectory import Trajectory
 
 
-def candidates(trajectory: Trajectory, key: Array, config: Config) -> Segments:
-    """Pairs of segments from `trajectory` (steps, num_envs, ...): (queries_per_round * candidates_per_query, 2, steps, ...).
+def candidates(trajectory: Trajectory, key: Array, settings: QuerySettings) -> Segments:
+    """Pairs of segments from `trajectory` (steps, num_envs, ...): (per_round * candidates_per_query, 2, steps, ...).
 
     Starts and environments are uniform, lengths uniform from `min_segment_length` to `segment_length`; a segment ends earlier
     where its episode does.
     """
     steps, num_envs = trajectory.truncated.shape
-    shape = (config.queries_per_round * config.candidates_per_query, 2)
+    shape = (settings.per_round * settings.candidates_per_query, 2)
     key_env, key_start, key_length = jax.random.split(key, 3)
-    env = jax.random.randint(key_env, shape, 0, num_envs)[..., None]
-    start = jax.random.randint(key_start, shape, 0, steps - config.segment_length + 1)[..., None]
-    length = jax.random.randint(key_length, shape, config.min_segment_length, config.segment_length + 1)[..., None]
-    offset = jnp.arange(config.segment_length)[None, None]
+    env = jax.random.randint(key_env, shape, 0, num_envs, jnp.int32)[..., None]
+    start = jax.random.randint(key_start, shape, 0, steps - settings.segment_length + 1, jnp.int32)[..., None]
+    length = jax.random.randint(key_length, shape, settings.min_segment_length, settings.segment_length + 1, jnp.int32)[
+        ..., None
+    ]
+    offset = jnp.arange(settings.segment_length)[None, None]
     cut = jax.tree.map(lambda rows: rows[start + offset, env], trajectory)
-    over = jnp.maximum(cut.transition.terminated, cut.truncated.astype(jnp.float32))
+    over = cut.transition.terminated | cut.truncated
     ended_before = jnp.cumsum(over, -1) - over > 0
     return Segments(
         observation=cut.transition.observation,
         action=cut.transition.action,
-        mask=jnp.where((offset < length) & ~ended_before, 1.0, 0.0),
+        mask=(offset < length) & ~ended_before,
         state=cut.state,
         next_state=cut.next_state,
     )
@@ -58,33 +62,34 @@ def disagreement(logits: Array) -> Array:
     return jnp.var(jax.nn.sigmoid(logits), 0)
 
 
-def choose(logits: Array, descriptions: Array, key: Array, config: Config) -> Array:
-    """Indices (queries_per_round,) of the candidates to ask, best first: none twice, and near-duplicates last.
+def choose(logits: Array, descriptions: Array, key: Array, settings: QuerySettings) -> Array:
+    """Indices (per_round,) of the candidates to ask, best first: none twice, and near-duplicates last.
 
     Args:
       logits: (members, candidates) of the first segment being preferred.
       descriptions: (candidates, n) of each pair; a pair near an already chosen one counts for less,
         1 - exp(-(distance / typical distance)^2). Between equals, all of no worth for example, chance decides.
     """
+    chex.assert_equal(logits.shape[1], descriptions.shape[0])
     score = {
         "information_gain": lambda: information_gain(logits) + 1e-9,
         "disagreement": lambda: disagreement(logits) + 1e-9,
-        "random": lambda: jax.random.uniform(key, logits.shape[1:], minval=1e-3),
-    }[config.query_strategy]()
-    luck = jax.random.uniform(jax.random.fold_in(key, 1), score.shape)
+        "random": lambda: jax.random.uniform(key, logits.shape[1:], jnp.float32, minval=1e-3),
+    }[settings.strategy]()
+    luck = jax.random.uniform(jax.random.fold_in(key, 1), score.shape, jnp.float32)
     # mean squared distance of two candidates
     typical = 2 * jnp.mean(jnp.var(descriptions, 0)) * descriptions.shape[1] + 1e-6
 
     def take(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
         score, free = carry
         offered = jnp.where(free, score, -1.0)
-        best = jnp.argmax(jnp.where(offered == jnp.max(offered), luck, -1.0))
+        best = jnp.argmax(jnp.where(offered == jnp.max(offered), luck, -1.0)).astype(jnp.int32)
         squared = jnp.sum((descriptions - descriptions[best][None]) ** 2, -1)
         # a tenth of the typical distance counts as near
         score = score * -jnp.expm1(-100 * squared / typical)
         return (score, free & (jnp.arange(score.shape[0]) != best)), best
 
-    _, chosen = jax.lax.scan(take, (score, jnp.ones(score.shape, bool)), None, config.queries_per_round)
+    _, chosen = jax.lax.scan(take, (score, jnp.ones(score.shape, bool)), None, settings.per_round)
     return chosen
 
 
@@ -93,5 +98,6 @@ def describe(segments: Segments) -> Array:
     length = jnp.sum(segments.mask, -1)
     last = jnp.maximum(length - 1, 0).astype(jnp.int32)
     ends = jnp.take_along_axis(segments.observation, last[..., None, None], -2)[..., 0, :]
-    parts = jnp.concatenate([segments.observation[..., 0, :], ends, length[..., None] / segments.mask.shape[-1]], -1)
+    share = (length / segments.mask.shape[-1]).astype(jnp.float32)
+    parts = jnp.concatenate([segments.observation[..., 0, :], ends, share[..., None]], -1)
     return parts.reshape(parts.shape[0], -1)

@@ -1,4 +1,4 @@
-"""Teachers: who answers queries. The synthetic human answers from a biased belief, by the paper's Eq. (2).
+"""The synthetic human, who answers from a biased belief, by the paper's Eq. (2).
 
 P(segment 1 preferred) = sigmoid(rationality * (Z_1 - Z_2)),    Z = sum_t myopia^(end - t) (l_H(s'|s,a) + r_H(s,a,s')),
 
@@ -8,22 +8,16 @@ with l_H the belief's log-density against the perceptual kernel. Mistakes, ties,
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 import peps_envs
-from peps_jax.config import Config
-from peps_jax.trajectory import Preferences, Segments
-
-
-class Teacher(NamedTuple):
-    """Who answers. `answer(key, segments, config) -> Preferences`; a person's answers come in as this same value."""
-
-    answer: Callable[[Array, Segments, Config], Preferences]
+from peps_jax.config import Problem
+from peps_jax.preferences.data import Answers, Queries, Segments
+from peps_jax.settings import HumanSettings
 
 
 def log_weight(
@@ -37,30 +31,31 @@ def log_weight(
     )
 
 
-def segment_values(segments: Segments, config: Config) -> Array:
+def segment_values(segments: Segments, problem: Problem, settings: HumanSettings) -> Array:
     """Z of Eq. (2) for each segment, (...): what the human thinks of it, with its end weighed more if it is myopic."""
-    environment, _, belief = config.task()
-    score = lambda state, action, next_state: sum(log_weight(environment, belief, state, action, next_state))
+    score = lambda state, action, next_state: sum(
+        log_weight(problem.environment, problem.belief, state, action, next_state)
+    )
     for _ in segments.mask.shape:
         score = jax.vmap(score)
     values = score(segments.state, segments.action, segments.next_state)
-    steps_to_end = jnp.sum(segments.mask, -1, keepdims=True) - jnp.cumsum(segments.mask, -1)
-    return jnp.sum(values * segments.mask * config.myopia ** jnp.maximum(steps_to_end, 0.0), -1)
+    shown = jnp.where(segments.mask, 1.0, 0.0).astype(jnp.float32)
+    steps_to_end = jnp.sum(shown, -1, keepdims=True) - jnp.cumsum(shown, -1)
+    weight = settings.myopia ** jnp.maximum(steps_to_end, 0.0)
+    return jnp.sum(jnp.where(segments.mask, values, 0.0) * weight, -1).astype(jnp.float32)
 
 
-def answer(key: Array, segments: Segments, config: Config) -> Preferences:
-    """The synthetic human's answers to queries `segments` (queries, 2, steps, ...)."""
+def answer(key: Array, queries: Queries, problem: Problem, settings: HumanSettings) -> Answers:
+    """The synthetic human's answers to `queries`."""
     key_choice, key_mistake = jax.random.split(key)
-    values = segment_values(segments, config)
+    values = segment_values(queries.segments, problem, settings)
     difference = values[:, 0] - values[:, 1]
-    first = jax.random.uniform(key_choice, difference.shape) < jax.nn.sigmoid(config.rationality * difference)
-    mistaken = jax.random.uniform(key_mistake, difference.shape) < config.mistake_rate
+    chance = lambda key: jax.random.uniform(key, difference.shape, jnp.float32)
+    first = chance(key_choice) < jax.nn.sigmoid(settings.rationality * difference)
+    mistaken = chance(key_mistake) < settings.mistake_rate
     choice = jnp.where(first ^ mistaken, 1.0, 0.0)
-    return Preferences(
-        segments=segments,
-        answers=jnp.where(jnp.abs(difference) < config.indifference, 0.5, choice),
-        answered=jnp.where(jnp.max(values, -1) < config.skip_below, 0.0, 1.0),
+    return Answers(
+        number=queries.number,
+        preferred=jnp.where(jnp.abs(difference) < settings.indifference, 0.5, choice),
+        weight=jnp.where(jnp.max(values, -1) < settings.skip_below, 0.0, 1.0),
     )
-
-
-SYNTHETIC = Teacher(answer=answer)

@@ -242,14 +242,14 @@ def variants(base: Config) -> dict[str, tuple[str, dict[str, Any]]]:
         "PEPS": ("peps", {}),
         "without environment entropy": ("peps", {"environment_entropy_weight": 0.0}),
         "without policy entropy": ("peps", {"policy_entropy_weight": 0.0}),
-        "absolute entropies": ("peps_absolute", {}),
+        "absolute entropies": ("peps", {"entropies": "absolute"}),
         "r̂'s 0.95 quantile at 0": ("peps", {"level": "quantile"}),
         "r̂'s maximum at 0": ("peps", {"level": "max"}),
         "r̂'s mean at 0, deviation 1": ("peps", {"level": "standard"}),
-        "r̂'s level free: equal lengths": ("peps", {"level": "none", "min_segment_length": base.segment_length}),
+        "r̂'s level free: equal lengths": ("peps", {"min_segment_length": base.segment_length}),
         "single network": ("peps", {"ensemble_size": 1}),
         "DRLHP": ("drlhp", {}),
-        "DRLHP, not normalised": ("drlhp_unscaled", {}),
+        "DRLHP, normalised by its authors' way": ("drlhp", {"level": "standard"}),
     }
 
 

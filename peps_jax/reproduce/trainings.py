@@ -21,6 +21,7 @@ from peps_jax.analysis.surrogate_maps import surrogate_values
 from peps_jax.config import Config
 from peps_jax.evaluate import Evaluation, evaluate
 from peps_jax.execution import batches
+from peps_jax.execution.program import FinishedRun, Times, shared
 from peps_jax.execution.progress import Display
 from peps_jax.reproduce.store import ROUTES, Record, Store, episodes, settings_of
 from peps_jax.train import Result, check
@@ -143,7 +144,7 @@ class Study:
             keep(planned, _plan(planned, self.num_episodes))
         trainings = [what for what in missing if isinstance(what, Training)]
 
-        def keep_batch(done: batches.Batch, finished: Sequence[batches.Finished], times: batches.Times) -> None:
+        def keep_batch(done: batches.Batch, finished: Sequence[FinishedRun], times: Times) -> None:
             seconds = (times.run + times.evaluate) / len(done.cells)
             for place, cell in zip(done.cells, finished, strict=True):
                 keep(trainings[place], _reduce(cell, self.num_episodes, seconds))
@@ -155,12 +156,12 @@ class Study:
                 batches.run(configs, divided, self.num_episodes, display)
 
 
-def _reduce(cell: batches.Finished, num_episodes: int, seconds: float) -> Record:
+def _reduce(cell: FinishedRun, num_episodes: int, seconds: float) -> Record:
     """What is kept of a finished training, its samples' evaluation and r-hat over the map among it."""
-    # the task's numbers in place of names: every world shares these programs
-    result = cell.result.replace(config=batches.shared(cell.result.config), curves={})
+    # names in place of which the training has code and numbers: every environment shares these programs
+    result = Result(cell.training.replace(config=shared(cell.config)), cell.agents, cell.knowledge, None, {})
     heat = {}
-    if hasattr(result.knowledge, "surrogate"):
+    if result.surrogate is not None:
         heat = dict(zip(("learned", "true", "free"), surrogate_values(result), strict=True))
     return Record(
         mode=episodes(cell.evaluation),
@@ -174,7 +175,7 @@ def _reduce(cell: batches.Finished, num_episodes: int, seconds: float) -> Record
 
 @functools.partial(jax.jit, static_argnums=1)
 def _evaluate_samples(result: Result, num_episodes: int) -> Evaluation:
-    return evaluate(result, result.config, num_episodes, stochastic=True)
+    return evaluate(result, num_episodes, stochastic=True)
 
 
 def _plan(planned: Planned, num_episodes: int) -> Record:

@@ -110,7 +110,7 @@ def _run(sweep: Sweep, wanted: Request, team: workers.Team) -> int:
 def _tell(rows: Sequence[Row], wanted: Request, pictures: Sequence[str]) -> int:
     """Shows what a complete sweep found, and where; returns the exit code."""
     print_table(rows)
-    failed = sum(row.finished.failed for row in rows)
+    failed = sum(row.run.failed for row in rows)
     if failed:
         print(f"{failed} of {len(rows)} cells failed: something learned or evaluated is not finite")
     print(

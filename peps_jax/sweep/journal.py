@@ -21,8 +21,8 @@ import jax
 import numpy as np
 
 from peps_jax.config import Config
-from peps_jax.execution.batches import Finished, Times, shared
 from peps_jax.execution.checkpoints import FORMAT, Checkpoints
+from peps_jax.execution.program import FinishedRun, Times, shared
 from peps_jax.storage import files, ownership
 from peps_jax.sweep import results
 
@@ -114,7 +114,7 @@ class Ledger:
         about = {name: value for name, value in self._about.items() if name != "format"}
         return Checkpoints(self.folder / _name(number), about | {"cells": numbers_digest(cells)})
 
-    def commit(self, number: int, cells: Mapping[str, Finished], times: Times) -> None:
+    def commit(self, number: int, cells: Mapping[str, FinishedRun], times: Times) -> None:
         """Writes the cells' files, and then that batch `number` is done; it needs no checkpoint any more."""
         sums = {training: results.write_cell(self._results, training, finished) for training, finished in cells.items()}
         content = {"cells": sums, "times": times._asdict()}

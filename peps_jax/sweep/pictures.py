@@ -33,7 +33,7 @@ MOMENTS = 3  # of an episode, in an environment that has a picture of itself
 
 
 def _good(rows: Sequence[Row]) -> list[Row]:
-    return [row for row in rows if not row.finished.failed]
+    return [row for row in rows if not row.run.failed]
 
 
 def _values(rows: Sequence[Row], key: Callable[[Row], Any]) -> list[Any]:
@@ -95,9 +95,9 @@ def learning_curves(rows: Sequence[Row]) -> Figure | None:
 
 def _curve(axes: Axes, members: Sequence[Row], curve: str) -> np.ndarray:
     """One method's line and band; returns the line without its first fifth."""
-    config = members[0].finished.result.config
+    config = members[0].run.config
     width = max(1, config.num_rounds // 15)
-    curves = [row.finished.result.curves for row in members]
+    curves = [row.run.curves for row in members]
     seeds = np.stack([_smooth(own[curve], own["episodes"], width) for own in curves])
     places = np.flatnonzero(np.isfinite(seeds).any(0))
     mean, low, high = (reduce(seeds[:, places], 0) for reduce in (np.nanmean, np.nanmin, np.nanmax))
@@ -140,7 +140,7 @@ def _frontier_line(axes: Axes, points: Sequence[Sequence[Row]], method: str) -> 
     """One method's points, in the order of lambda, joined by a line."""
     if not points:
         return
-    score = lambda row: (np.mean(row.finished.evaluation.return_), np.mean(row.finished.evaluation.explicability))
+    score = lambda row: (np.mean(row.run.evaluation.return_), np.mean(row.run.evaluation.explicability))
     seeds = [np.array([score(row) for row in members]) for members in points]
     means, spreads = np.array([s.mean(0) for s in seeds]), np.array([s.std(0) for s in seeds])
     colour = colour_of(method)
@@ -159,7 +159,7 @@ def _frontier_line(axes: Axes, points: Sequence[Sequence[Row]], method: str) -> 
 
 
 def _navigates(row: Row) -> bool:
-    return isinstance(row.finished.result.config.task()[0], Navigation)
+    return isinstance(row.run.training.problem.environment, Navigation)
 
 
 def routes(rows: Sequence[Row], episodes: int = 3) -> Figure | None:
@@ -206,21 +206,22 @@ def _opacity(members: Sequence[Row]) -> float:
 
 
 def _routes_panel(axes: Axes, members: Sequence[Row], episodes: int) -> None:
-    draw_map(axes, members[0].finished.result.config.task()[1])
+    draw_map(axes, members[0].run.training.problem.params)
     for row in members:
-        evaluation = row.finished.evaluation
+        evaluation = row.run.evaluation
         for route, length in zip(evaluation.perceived[:episodes], evaluation.length[:episodes], strict=True):
             draw_route(axes, route[: int(length) + 1], row.cell.method, _opacity(members))
-    draw_start(axes, members[0].finished.result.config.task()[1])
+    draw_start(axes, members[0].run.training.problem.params)
 
 
 def _moments(row: Row) -> dict[str, Scene]:
     """Moments of one episode by their times; none of an environment that has no picture."""
-    environment, params, _ = methods.task(row.finished.result.config)
+    problem = row.run.training.problem
+    environment, params = problem.environment, problem.params
     start, _ = environment.reset(jax.random.key(0), params)
     if environment.scene(start, params) is None:
         return {}
-    states, length = jax.tree.map(np.asarray, _episode(row.finished.result, jax.random.key(0)))
+    states, length = jax.tree.map(np.asarray, _episode(row.run, jax.random.key(0)))
     times = np.linspace(0, int(length), MOMENTS + 1)[1:].round()
     shown = scenes.scenes_of(environment, params, states, times)
     return {f"step {time:.0f}": scene for time, scene in zip(times, shown, strict=True)}
@@ -229,7 +230,7 @@ def _moments(row: Row) -> dict[str, Scene]:
 @jax.jit
 def _episode(result: Result, key: Any) -> tuple[Any, Any]:
     """States (horizon + 1, ...) of an episode of `result`, the last one repeated after its end, and the episode's length."""
-    environment, params, _ = methods.task(result.config)
+    environment, params = result.training.problem.environment, result.training.problem.params
     policy = result.policy()
 
     def move(carry: Any, key: Any) -> tuple[Any, Any]:
@@ -262,10 +263,10 @@ def _moments_panel(axes: Axes, shown: Mapping[str, Scene]) -> None:
 def _perceived_panel(axes: Axes, members: Sequence[Row], episodes: int) -> None:
     """How far each part of the perceived state is from where it started, in perceptual widths, a style of line for each."""
     tidy(axes)
-    environment, params, _ = members[0].finished.result.config.task()
-    width = np.asarray(environment.perception_width(params))
+    problem = members[0].run.training.problem
+    width = np.asarray(problem.environment.perception_width(problem.params))
     for row in members:
-        evaluation = row.finished.evaluation
+        evaluation = row.run.evaluation
         for perceived, length in zip(evaluation.perceived[:episodes], evaluation.length[:episodes], strict=True):
             seen = np.asarray(perceived[: int(length) + 1])
             for part, style in zip(((seen - seen[:1]) / width[None]).T, itertools.cycle(("-", "--", ":", "-."))):
@@ -276,7 +277,7 @@ def _perceived_panel(axes: Axes, members: Sequence[Row], episodes: int) -> None:
 
 def surrogate_maps(rows: Sequence[Row]) -> Figure | None:
     """r_hat as a heat map beside the true l_H + r_H, for the first seed of each environment and method that learned one."""
-    rows = [row for row in _good(rows) if _navigates(row) and hasattr(row.finished.result.knowledge, "surrogate")]
+    rows = [row for row in _good(rows) if _navigates(row) and row.run.surrogate is not None]
     if not rows:
         return None
     lam = _middle_lam(rows)
@@ -286,8 +287,8 @@ def surrogate_maps(rows: Sequence[Row]) -> Figure | None:
             first.setdefault((row.cell.env, row.cell.method), row)
     figure, panels = panels_of(len(first), 2, 3.3, 2.75)
     for line, ((env, method), row) in enumerate(first.items()):
-        learned, true, free = surrogate_values(row.finished.result)
-        params = row.finished.result.config.task()[1]
+        learned, true, free = surrogate_values(row.run)
+        params = row.run.training.problem.params
         agreement = rank_correlation(learned[free], true[free])
         titles = (f"learned r̂  (rank correlation {agreement:.2f})", "true ℓ_H + r_H")
         for axes, values, title in zip(panels[line], (learned, true), titles, strict=True):

@@ -32,10 +32,10 @@ from peps_envs.registry import unknown_name
 from peps_jax.config import Config
 from peps_jax.evaluate import Evaluation
 from peps_jax.execution import machine
-from peps_jax.execution.batches import Finished, Times, empty_finished
+from peps_jax.execution.program import FinishedRun, Times, empty_finished
 from peps_jax.storage import files
 from peps_jax.storage.tables import csv_bytes
-from peps_jax.train import Result, init
+from peps_jax.train import Result, init, prepare
 
 MANIFEST, TABLE, CURVES, CELLS = "manifest.json", "results.csv", "curves.npz", "cells"
 PICTURES = ("learning_curves.png", "frontier.png", "routes.png", "surrogate.png")
@@ -64,7 +64,7 @@ class Row(NamedTuple):
     """A finished cell."""
 
     cell: Cell
-    finished: Finished
+    run: FinishedRun
 
 
 def holds_results(folder: Path) -> bool:
@@ -117,11 +117,11 @@ def summary(evaluation: Evaluation) -> dict[str, float]:
 def record(row: Row) -> dict[str, Any]:
     """A row of the table."""
     cell = row.cell
-    status = "failed" if row.finished.failed else "ok"
+    status = "failed" if row.run.failed else "ok"
     return (
         {key: getattr(cell, key) for key in KEYS}
         | {"status": status}
-        | summary(row.finished.evaluation)
+        | summary(row.run.evaluation)
         | {"cell": cell.name}
     )
 
@@ -129,11 +129,11 @@ def record(row: Row) -> dict[str, Any]:
 # --- writing --------------------------------------------------------------------------------------------------------------
 
 
-def write_cell(folder: Path, training: str, finished: Finished) -> str:
+def write_cell(folder: Path, training: str, run: FinishedRun) -> str:
     """Writes what a training left; returns the file's checksum. Raises NotWrittenError."""
     path = folder / CELLS / f"{training}.msgpack"
     files.make_folder(path.parent)
-    content = files.seal(_learned(finished))
+    content = files.seal(_learned(run))
     files.write_whole(path, content)
     return files.digest(content)
 
@@ -181,23 +181,22 @@ def _entry(row: Row) -> dict[str, Any]:
     return {"name": cell.name} | {key: getattr(cell, key) for key in KEYS} | {"file": cell.file}
 
 
-def _learned(finished: Finished) -> bytes:
-    """What a training leaves; the world's numbers too, so that it is evaluated in the world it was trained in."""
-    result = finished.result
-    _, params, belief = result.config.task()
+def _learned(run: FinishedRun) -> bytes:
+    """What a training leaves; the environment's numbers too, so that it is evaluated in the one that it was trained in."""
+    problem = run.config.problem()
     parts = {
-        "agents": result.agents,
-        "knowledge": result.knowledge,
-        "curves": result.curves,
-        "params": params,
-        "belief": belief,
-        "evaluation": finished.evaluation,
-        "failed": finished.failed,
+        "agents": run.agents,
+        "knowledge": run.knowledge,
+        "curves": run.curves,
+        "params": problem.params,
+        "belief": problem.belief,
+        "evaluation": run.evaluation,
+        "failed": run.failed,
     }
     return flax.serialization.to_bytes(jax.tree.map(np.asarray, parts))
 
 
-def read_cell(folder: Path, training: str, config: Config, num_episodes: int, checksum: str) -> Finished:
+def read_cell(folder: Path, training: str, config: Config, num_episodes: int, checksum: str) -> FinishedRun:
     """What `write_cell` was given.
 
     Raises:
@@ -210,22 +209,24 @@ def read_cell(folder: Path, training: str, config: Config, num_episodes: int, ch
     if files.digest(content) != checksum:
         raise files.DamagedError("its checksum is wrong")
     stored = flax.serialization.msgpack_restore(files.unseal(content))
-    result, evaluation = empty_finished(config, num_episodes)
+    empty, evaluation = empty_finished(config, num_episodes)
     restore = flax.serialization.from_state_dict
-    result = result.replace(
-        agents=restore(result.agents, stored["agents"]),
-        knowledge=restore(result.knowledge, stored["knowledge"]),
+    return FinishedRun(
+        training=prepare(config),
+        agents=restore(empty.agents, stored["agents"]),
+        knowledge=restore(empty.knowledge, stored["knowledge"]),
+        preferences=None,
         curves=stored["curves"],
-        config=config,
+        evaluation=restore(evaluation, stored["evaluation"]),
+        failed=bool(stored["failed"]),
     )
-    return Finished(result, restore(evaluation, stored["evaluation"]), bool(stored["failed"]))
 
 
 def _curves(rows: Sequence[Row]) -> bytes:
-    names = sorted({name for row in rows for name in row.finished.result.curves})
-    config = rows[0].finished.result.config
+    names = sorted({name for row in rows for name in row.run.curves})
+    config = rows[0].run.config
     nothing = np.full(config.num_rounds, np.nan, np.float32)
-    curves = {name: np.stack([row.finished.result.curves.get(name, nothing) for row in rows]) for name in names}
+    curves = {name: np.stack([row.run.curves.get(name, nothing) for row in rows]) for name in names}
     env_steps = config.steps_per_round * np.arange(1, config.num_rounds + 1)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, env_steps=env_steps, **curves)
@@ -254,9 +255,9 @@ def load(folder: str | os.PathLike[str], cell: int | str | Mapping[str, Any]) ->
         raise ValueError(f"folder {str(folder)!r} holds no sweep's results: {MANIFEST} is missing or broken") from None
     entry = _find(cells, cell)
     config = _config(configuration, entry)
-    _, params, belief = config.task()
-    shapes = jax.eval_shape(init, config)
-    empty = {"agents": shapes.agents, "knowledge": shapes.knowledge, "params": params, "belief": belief}
+    problem = config.problem()
+    shapes = jax.eval_shape(lambda config: init(prepare(config)), config)
+    empty = {"agents": shapes.agents, "knowledge": shapes.knowledge, "params": problem.params, "belief": problem.belief}
     path = folder / entry["file"]
     try:
         content = path.read_bytes()
@@ -272,7 +273,7 @@ def load(folder: str | os.PathLike[str], cell: int | str | Mapping[str, Any]) ->
         reason = str(error).splitlines()[0]
         raise ValueError(f"file {str(path)!r} was written by a version that doesn't fit this one: {reason}") from None
     config = config.replace(params=parts["params"], belief=parts["belief"])
-    return Result(agents=parts["agents"], knowledge=parts["knowledge"], curves=curves, config=config)
+    return Result(prepare(config), parts["agents"], parts["knowledge"], None, curves)
 
 
 def _find(cells: Sequence[Mapping[str, Any]], wanted: int | str | Mapping[str, Any]) -> Mapping[str, Any]:

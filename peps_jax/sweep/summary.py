@@ -33,7 +33,7 @@ def print_table(rows: Sequence[Row]) -> None:
         groups.setdefault((row.cell.env, row.cell.method, lam), []).append(row)
     for key, members in groups.items():
         trainings = {row.cell.training: row for row in members}.values()
-        records = [records_of[row.cell.training] for row in trainings if not row.finished.failed]
+        records = [records_of[row.cell.training] for row in trainings if not row.run.failed]
         failed = len(trainings) - len(records)
         seeds = f"{len(records)}" + (f", {failed} failed" if failed else "")
         figures = (_spread(records, name) for name in ("return_mean", "explicability_mean"))

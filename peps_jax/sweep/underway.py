@@ -12,6 +12,8 @@ import jax
 import numpy as np
 
 from peps_jax.execution import batches, checkpoints, machine, memory
+from peps_jax.execution.devices import side_by_side
+from peps_jax.execution.program import FinishedRun, Progress, Times, empty_progress
 from peps_jax.execution.progress import Display, env_steps
 from peps_jax.storage import files
 from peps_jax.storage.ownership import Owner
@@ -45,8 +47,8 @@ class Sweep:
         self._places = {name: place for place, name in enumerate(wanted.trainings)}
         self._writer = results.Writer(wanted.out, command, wanted.settings)
         self._ledger = journal.Ledger(wanted.out, _about(wanted))
-        self._finished: dict[str, batches.Finished] = {}
-        self._times, self._env_steps = batches.Times(), 0
+        self._finished: dict[str, FinishedRun] = {}
+        self._times, self._env_steps = Times(), 0
         self._tables = checkpoints.Rhythm(1.0)
         self._plan = journal.Plan((), (), "")
 
@@ -108,7 +110,7 @@ class Sweep:
     def _divided(self) -> list[batches.Batch]:
         devices = jax.devices()
         free = None  # measured
-        if self._team.neighbours > 1 and not batches.side_by_side(devices):
+        if self._team.neighbours > 1 and not side_by_side(devices):
             free = memory.available_bytes(devices) // self._team.neighbours
         most = batches.cells_soon_done(devices)
         return batches.plan(self._configs, self._wanted.episodes, devices, free, most, self._team.count)
@@ -151,16 +153,16 @@ class Sweep:
             with self._tables.making():
                 self._writer.save(self.rows(), self._times, self._env_steps, status)
 
-    def keep(self, number: int, finished: Sequence[batches.Finished], times: batches.Times) -> None:
+    def keep(self, number: int, finished: Sequence[FinishedRun], times: Times) -> None:
         """Writes a batch that this process has finished."""
         cells = dict(zip(self._plan.batches[number].trainings, finished, strict=True))
         self._ledger.commit(number, cells, times)
         self._take(cells, times)
 
-    def _take(self, cells: Mapping[str, batches.Finished], times: batches.Times) -> None:
+    def _take(self, cells: Mapping[str, FinishedRun], times: Times) -> None:
         self._finished |= cells
         self._times += times
-        self._env_steps += sum(env_steps(cell.result.config) for cell in cells.values())
+        self._env_steps += sum(env_steps(cell.config) for cell in cells.values())
         if self._tables.due():
             self.save("running")
 
@@ -235,13 +237,13 @@ class Keeper(Display):
         self._number_of = {one: number for number, one in sweep.batches.items()}
         self._rhythm = checkpoints.Rhythm(sweep._wanted.running["checkpoint_every"])
 
-    def start(self, current: batches.Batch) -> batches.Progress | None:
+    def start(self, current: batches.Batch) -> Progress | None:
         self._sweep.owner.check()
         if self._stop.is_set():
             raise StoppedError
         self._checkpoints = self._sweep.checkpoints(self._number_of[current])
         first = self._configs[current.cells[0]]
-        progress = self._checkpoints.latest(batches.empty_progress(first, len(current.cells)))
+        progress = self._checkpoints.latest(empty_progress(first, len(current.cells)))
         self.begin(current, progress.rounds if progress else 0)
         return progress
 
@@ -250,7 +252,7 @@ class Keeper(Display):
         current: batches.Batch,
         rounds: int,
         curves: dict[str, np.ndarray],
-        snapshot: Callable[[], batches.Progress],
+        snapshot: Callable[[], Progress],
     ) -> None:
         super().advanced(current, rounds, curves, snapshot)
         self._sweep.owner.check()  # not only when something is written: no hours for nothing
@@ -260,7 +262,7 @@ class Keeper(Display):
         if self._stop.is_set():
             raise StoppedError
 
-    def finished(self, current: batches.Batch, cells: Sequence[batches.Finished], times: batches.Times) -> None:
+    def finished(self, current: batches.Batch, cells: Sequence[FinishedRun], times: Times) -> None:
         self._sweep.keep(self._number_of[current], cells, times)
 
 

@@ -43,9 +43,3 @@ def reward(vehicles: Vehicles, lanes: int) -> Array:
     fast = jnp.clip((vehicles.speed[0] * jnp.cos(vehicles.heading[0]) - 20) / 10, 0, 1)
     total = 0.4 * fast + 0.1 * vehicles.target_lane[0] / max(lanes - 1, 1) - vehicles.crashed[0]
     return (total + 1) / 1.5 * vehicle.on_lane(x, y, vehicle.closest_lane(x, y, lanes))
-
-
-def perceive(observation: Array, lanes: int) -> Array:
-    """(..., 3): gap to the nearest car seen, bumper to bumper, m; lateral position, m; forward speed, m/s."""
-    gap = observation[..., COLUMNS + 1] * SIGHT - LENGTH
-    return jnp.stack([gap, observation[..., 2] * LANE_WIDTH * lanes, observation[..., 3] * 2 * MAX_SPEED], axis=-1)

@@ -290,11 +290,6 @@ class Highway(Environment):
         vehicles = state.vehicles
         return jnp.stack([vehicles.x[1] - vehicles.x[0] - LENGTH, vehicles.y[0], vehicles.speed[0]])
 
-    def perceive_observation(self, observation: Array, params: HighwayParams) -> Array:
-        del params
-        gap = observation[..., EGO_FEATURES] * GAP_SCALE - LENGTH
-        return jnp.stack([gap, observation[..., 1] * LANE_WIDTH, observation[..., 0] * SPEED_SCALE], axis=-1)
-
     def perception_width(self, params: HighwayParams) -> Array:
         return params.perception_width
 
@@ -318,6 +313,3 @@ class ClassicHighway(Highway):
 
     def observe(self, state: HighwayState) -> Array:
         return classic.observe(state.vehicles, self.lanes).reshape(-1)
-
-    def perceive_observation(self, observation: Array, params: HighwayParams) -> Array:
-        return classic.perceive(observation, self.lanes)

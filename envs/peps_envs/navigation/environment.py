@@ -118,8 +118,6 @@ class Navigation(Environment):
         """The position (..., 2) that an observation (..., observation_size) was made of."""
         return (observation[..., :2] + 1) / 2 * params.size
 
-    perceive_observation = position_of
-
     def perception_width(self, params: NavigationParams) -> Array:
         return jnp.broadcast_to(params.perception_width, (2,))
 

@@ -16,9 +16,9 @@ from jax import Array
 from peps_envs.highway import Highway
 from peps_envs.highway.vehicle import LANE_LEFT, SLOWER
 from peps_jax import rollout
+from peps_jax.preferences.data import Answers, Segments
 from peps_jax.reproduce.driving.participants import answers, attentive, recruit
-from peps_jax.reproduce.driving.scenes import DRY, HORIZON, crashed, road, whole
-from peps_jax.trajectory import Preferences, Segments
+from peps_jax.reproduce.driving.scenes import DRY, HORIZON, crashed, road, whole, whole_scenes
 
 NUM_ACTIONS = Highway.action_space.size
 TRAINERS, ANSWERS = 15, 200  # participants who compare, and how many pairs each of them
@@ -51,11 +51,12 @@ def plans(key: Array, number: int) -> Array:
 def drive(key: Array, number: int) -> Segments:
     """Whole scenes of two drivers each on the dry road, who start alike: (number, 2, HORIZON, ...)."""
     key_start, key_plan, key_steps = jax.random.split(key, 3)
-    config = road(DRY, num_envs=2 * number, rollout_length=HORIZON)
-    starts = rollout.init(key_start, config.replace(num_envs=number))
+    problem = road(DRY).problem()
+    starts = rollout.init(key_start, problem, whole_scenes(number))
     actors = jax.tree.map(lambda rows: jnp.repeat(rows, 2, 0), starts)
     planned = plans(key_plan, 2 * number)
-    _, trajectory, _ = rollout.collect(actors, lambda observation, key, time: planned[:, time], key_steps, config)
+    act = lambda observation, key, time: planned[:, time]
+    _, trajectory, _ = rollout.collect(actors, act, key_steps, problem, whole_scenes(2 * number))
     return jax.tree.map(lambda rows: rows.reshape(number, 2, *rows.shape[1:]), whole(trajectory))
 
 
@@ -72,22 +73,27 @@ def cut(key: Array, scenes: Segments) -> Segments:
     one = lambda rows, place: rows[place]
     piece = jax.tree.map(lambda rows: jax.vmap(jax.vmap(one))(rows, place), scenes)
     shown = (offset < length) & (start + offset < HORIZON)
-    return piece._replace(mask=jnp.where(shown, piece.mask, 0.0))
+    return piece._replace(mask=shown & piece.mask)
 
 
-def compare(key: Array) -> Preferences:
-    """What the training group says of pieces of scenes on the dry road: TRAINERS * ANSWERS pairs, in none a collision.
-
-    Who fails the sanity check doesn't count. Pairs are in no order, so that any stretch of them is of all participants.
-    """
-    key_group, key_drive, key_cut, key_answer, key_check, key_order = jax.random.split(key, 6)
+def pairs_shown(key_drive: Array, key_cut: Array) -> Segments:
+    """What the training group is shown: TRAINERS * ANSWERS pairs of pieces of scenes on the dry road, in none a collision."""
     number = TRAINERS * ANSWERS
     pairs = cut(key_cut, drive(key_drive, SPARE * number))
     empty = jnp.min(jnp.sum(pairs.mask, -1), -1) == 0  # begins after a crash
     safe = jnp.argsort(jnp.any(crashed(pairs), -1) | empty, stable=True)[:number]
-    shown = jax.tree.map(lambda rows: rows[safe].reshape(TRAINERS, ANSWERS, *rows.shape[1:]), pairs)
+    return jax.tree.map(lambda rows: rows[safe], pairs)
+
+
+def compare(key: Array) -> tuple[Segments, Answers]:
+    """The pairs that the training group is shown, and what it says of them. Who fails the sanity check doesn't count."""
+    key_group, key_drive, key_cut, key_answer, key_check, _ = jax.random.split(key, 6)
+    pairs = pairs_shown(key_drive, key_cut)
+    shown = jax.tree.map(lambda rows: rows.reshape(TRAINERS, ANSWERS, *rows.shape[1:]), pairs)
     participants = recruit(key_group, TRAINERS)
-    given = answers(key_answer, participants, shown, road(DRY))
-    given = given._replace(answered=given.answered * attentive(key_check, participants)[:, None])
-    order = jax.random.permutation(key_order, number)
-    return jax.tree.map(lambda rows: rows.reshape(number, *rows.shape[2:])[order], given)
+    given = answers(key_answer, participants, shown, road(DRY).problem())
+    passed = attentive(key_check, participants)
+    flat = lambda rows: rows.reshape(-1)
+    weight = jnp.where(passed[:, None], given.weight, 0.0)
+    number = jnp.arange(TRAINERS * ANSWERS, dtype=jnp.int32)
+    return pairs, Answers(number, flat(given.preferred), flat(weight))

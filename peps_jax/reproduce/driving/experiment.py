@@ -11,15 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from peps_jax import methods
 from peps_jax.config import Config
-from peps_jax.execution import batches
-from peps_jax.learning import surrogate
-from peps_jax.reproduce.driving.comparisons import ANSWERS, TRAINERS, compare
+from peps_jax.execution.devices import compile_over_devices
+from peps_jax.execution.program import shared
+from peps_jax.preferences import data, teachers
+from peps_jax.preferences.data import Segments
+from peps_jax.reproduce.driving.comparisons import compare
 from peps_jax.reproduce.driving.ratings import GROUPS, Group, groups
 from peps_jax.reproduce.driving.scenes import BEHAVIOURS, HORIZON, RAIN, behaviour, crashed, road, watch_agent
-from peps_jax.train import Result, TrainingState, check, collect_and_ask, finish, improve, init
-from peps_jax.trajectory import Preferences, Segments
+from peps_jax.train import train
 
 METHODS = ("peps", "sac", "drlhp", "policy_shaping")
 RATED = METHODS[:3]  # by the paper's participants. A rating says how a scene compares with the others that a rater saw
@@ -30,7 +30,7 @@ FEW_SEEDS = 3  # at each lambda beside the study's own
 SETTINGS = dict(
     lam=2.0, gamma=0.99, num_envs=16, rollout_length=24, warmup_steps=1_920, updates_per_step=0.5,
     hold_steps=2, reward_scale=0.25, policy_entropy_weight=0.02, initial_temperature=2.0, temperature=0.01,
-    segment_length=HORIZON, num_queries=TRAINERS * ANSWERS, surrogate_learning_rate=2e-3,
+    segment_length=HORIZON, num_queries=1, surrogate_learning_rate=2e-3,  # nothing is asked: all was said before
 )  # fmt: skip
 LAMS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)  # over which PEPS is shown
 
@@ -38,36 +38,6 @@ LAMS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)  # over which PEPS is shown
 def settings(method: str, seed: int, steps: int = STEPS, **changes: Any) -> Config:
     """The training of one agent, in the rain."""
     return road(RAIN, method=method, total_steps=steps, **(SETTINGS | changes)).replace(seed=seed)
-
-
-def taught(config: Config, given: Preferences) -> Result:
-    """A training whose teacher has said everything before it begins: r-hat is fitted to all of `given` from the first round on.
-
-    What the method would ask in a round is not asked: which pairs are compared was chosen beforehand.
-    """
-    check(config)
-    method, state = methods.get(config.method), init(config)
-    key_add, key_rounds = jax.random.split(jax.random.fold_in(state.key, config.num_rounds))
-    share, last = config.queries_per_round, config.num_rounds - 1
-    blank = share * config.num_rounds - given.answers.shape[0]  # rows that the last round's share has too many
-    rows = jax.tree.map(lambda rows: jnp.pad(rows, [(0, blank)] + [(0, 0)] * (rows.ndim - 1)), given)
-    latest = jax.tree.map(lambda rows: rows[last * share :], rows)
-    if hasattr(state.knowledge, "surrogate"):
-        told = surrogate.add(state.knowledge.surrogate, rows, 0, key_add, config)
-        state = state.replace(knowledge=state.knowledge.replace(surrogate=told))
-
-    def one_round(state: TrainingState, index: Array) -> tuple[TrainingState, dict[str, Array]]:
-        state, _, collected = collect_and_ask(state, index, config)
-        key_learn, key_improve = jax.random.split(jax.random.fold_in(key_rounds, index))
-        filled = (index + 1) * config.steps_per_round
-        knowledge, learned = method.learn(
-            state.knowledge, state.replay, filled, latest, jnp.asarray(last), key_learn, config
-        )
-        state = state.replace(knowledge=knowledge)
-        agents, improved = improve(state, index, key_improve, config)
-        return state.replace(agents=agents), collected | learned | improved
-
-    return finish(*jax.lax.scan(one_round, state, jnp.arange(config.num_rounds)), config)
 
 
 class Seen(NamedTuple):
@@ -83,18 +53,18 @@ class Seen(NamedTuple):
 def learn(config: Config, episodes: int) -> Seen:
     """One agent, taught by a group of its own, in the rain."""
     key_group, key_watch = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1))
-    result = taught(config, compare(key_group))
+    result = train(config, teachers.recorded(data.recording(*compare(key_group))))
     scenes = watch_agent(result, key_watch, episodes)
-    environment, params, _ = config.task()
-    reward = jax.vmap(jax.vmap(environment.reward, (0, 0, 0, None)), (0, 0, 0, None))
-    rewards = reward(scenes.state, scenes.action, scenes.next_state, params)
+    problem = result.training.problem
+    reward = jax.vmap(jax.vmap(problem.environment.reward, (0, 0, 0, None)), (0, 0, 0, None))
+    rewards = reward(scenes.state, scenes.action, scenes.next_state, problem.params)
     leaves = jax.tree.leaves((result.agents, result.knowledge))
     learned = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
     return Seen(
         scenes=scenes,
         kind=behaviour(scenes),
         crashed=crashed(scenes),
-        return_=jnp.sum(rewards * scenes.mask, -1),
+        return_=jnp.sum(jnp.where(scenes.mask, rewards, 0.0), -1),
         finite=jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in learned])),
     )
 
@@ -130,7 +100,7 @@ def parts(
 def run_part(part: Part) -> Seen:
     """Trains and watches its agents over all devices: numpy arrays, (lams, seeds, ...)."""
     print(f"training {part.name}: {len(part.configs)} agents", file=sys.stderr, flush=True)
-    program, cells = batches.compile_over_devices(lambda config: learn(config, part.episodes), part.configs)
+    program, cells = compile_over_devices(lambda config: learn(config, part.episodes), list(map(shared, part.configs)))
     number, shape = len(part.configs), (len(part.lams), len(part.seeds))
     shaped = lambda rows: np.asarray(rows)[:number].reshape(*shape, *rows.shape[1:])
     return jax.tree.map(shaped, program(cells))
@@ -187,6 +157,6 @@ def run(wanted: Sequence[Part], number: int = GROUPS, make: Make = run_part) -> 
     print(f"{number} groups of raters", file=sys.stderr, flush=True)
     key = jax.random.fold_in(jax.random.key(wanted[0].seeds[0]), 2)
     papers = {method: shown for method, shown in scenes.items() if method in RATED}
-    wider = groups(key, scenes, road(RAIN), number) if len(scenes) > len(papers) else []
-    rated = groups(key, papers, road(RAIN), number)
+    wider = groups(key, scenes, road(RAIN).problem(), number) if len(scenes) > len(papers) else []
+    rated = groups(key, papers, road(RAIN).problem(), number)
     return Findings(scenes, conducts, dict(sorted(over_lam.items())), rated, wider)

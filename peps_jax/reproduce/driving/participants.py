@@ -10,10 +10,11 @@ from jax import Array
 import peps_envs
 from peps_envs.highway.environment import HighwayParams, Ratings
 from peps_envs.highway.vehicle import IDLE, SLOWER
-from peps_jax.config import Config
+from peps_jax.config import Problem
 from peps_jax.preferences import synthetic_human
+from peps_jax.preferences.data import Answers, Queries, Segments
 from peps_jax.reproduce.driving.scenes import DRY, road, watch
-from peps_jax.trajectory import Preferences, Segments
+from peps_jax.settings import HumanSettings
 
 CARELESS = 0.1  # share of participants who answer at random
 # Pairs of the sanity check. A coin passes one with a probability of a half, and a single participant of 15 who answers at
@@ -66,22 +67,34 @@ def mind(participant: Participants, params: HighwayParams) -> HighwayParams:
     )
 
 
-def answers(key: Array, participants: Participants, segments: Segments, config: Config) -> Preferences:
-    """Each participant's answers to pairs of their own: rows (participants, pairs, ...) of segments and answers."""
-    _, params, _ = config.task()
+def answers(key: Array, participants: Participants, segments: Segments, problem: Problem) -> Answers:
+    """Each participant's answers to pairs of their own, numbered from 0 on: rows (participants, pairs)."""
 
-    def one(key: Array, participant: Participants, segments: Segments) -> Preferences:
-        own = config.replace(belief=mind(participant, params), rationality=participant.rationality)
-        return synthetic_human.answer(key, segments, own)
+    def one(key: Array, participant: Participants, segments: Segments) -> Answers:
+        number = jnp.arange(segments.mask.shape[0], dtype=jnp.int32)
+        own = problem.replace(belief=mind(participant, problem.params))
+        return synthetic_human.answer(key, Queries(number, segments), own, manner(participant))
 
     return jax.vmap(one)(jax.random.split(key, participants.rationality.shape[0]), participants, segments)
 
 
+def manner(participant: Participants) -> HumanSettings:
+    """How a participant answers: by Eq. (2), as reliably as they are, and always."""
+    number = lambda value: jnp.asarray(value, jnp.float32)
+    return HumanSettings(
+        rationality=participant.rationality,
+        myopia=number(1.0),
+        mistake_rate=number(0.0),
+        indifference=number(0.0),
+        skip_below=number(-jnp.inf),
+    )
+
+
 def attentive(key: Array, participants: Participants) -> Array:
     """(participants,) bool: the sanity check, CHECKS pairs on a dry road. Who ever prefers a collision to braking fails."""
-    config = road(DRY)
+    problem = road(DRY).problem()
     plans = [lambda observation, key, time, action=action: jnp.full(CHECKS, action) for action in (SLOWER, IDLE)]
-    pairs = jax.tree.map(lambda *rows: jnp.stack(rows, 1), *(watch(plan, config, key, CHECKS) for plan in plans))
+    pairs = jax.tree.map(lambda *rows: jnp.stack(rows, 1), *(watch(plan, problem, key, CHECKS) for plan in plans))
     number = participants.rationality.shape[0]
     shown = jax.tree.map(lambda rows: jnp.broadcast_to(rows, (number, *rows.shape)), pairs)
-    return jnp.all(answers(key, participants, shown, config).answers == 1.0, 1)
+    return jnp.all(answers(key, participants, shown, problem).preferred == 1.0, 1)

@@ -10,24 +10,23 @@ import numpy as np
 from jax import Array
 
 from peps_jax import explicability
-from peps_jax.config import Config
+from peps_jax.config import Problem
+from peps_jax.preferences.data import Segments
 from peps_jax.reproduce.driving.participants import Participants, attentive, mind, recruit
-from peps_jax.trajectory import Segments
 
 RATERS, SHOWN = 15, 3  # participants who rate, and scenes of each method that they see
 GROUPS = 100  # of raters, re-drawn
 
 
-def worth(participant: Participants, scenes: Segments, config: Config) -> Array:
+def worth(participant: Participants, scenes: Segments, problem: Problem) -> Array:
     """(n,) explicability of `scenes` (n, horizon, ...) to one participant: sum r_H + sum (l_H - l_A) by their own belief."""
-    environment, params, _ = config.task()
-    belief = mind(participant, params)
-    score = lambda *transition: explicability.score(environment, params, belief, *transition)
+    own = problem.replace(belief=mind(participant, problem.params))
+    score = lambda *transition: explicability.score(own, *transition)
     scores = jax.vmap(jax.vmap(score))(scenes.state, scenes.action, scenes.next_state)
-    return jnp.sum(scores.explicability * scenes.mask, -1)
+    return jnp.sum(jnp.where(scenes.mask, scores.explicability, 0.0), -1)
 
 
-def rate(key: Array, participants: Participants, scenes: Segments, config: Config) -> Array:
+def rate(key: Array, participants: Participants, scenes: Segments, problem: Problem) -> Array:
     """(participants, n) ratings from 1 to 10 of `scenes` (n, horizon, ...), which each participant has seen all of.
 
     rating_i = 1 + 9 mean_j sigmoid(rationality (E_i - E_j)): how often they would prefer the scene to another one that they
@@ -35,7 +34,7 @@ def rate(key: Array, participants: Participants, scenes: Segments, config: Confi
     """
 
     def one(key: Array, participant: Participants) -> Array:
-        value = worth(participant, scenes, config)
+        value = worth(participant, scenes, problem)
         wins = jax.nn.sigmoid(participant.rationality * (value[:, None] - value[None]))
         felt = 1 + 9 * jnp.mean(wins, 1) + jax.random.normal(key, value.shape)
         return jnp.clip(jnp.round(felt), 1.0, 10.0)
@@ -67,15 +66,15 @@ def analyse(ratings: dict[str, np.ndarray]) -> Group:
     )
 
 
-def groups(key: Array, scenes: dict[str, Segments], config: Config, number: int = GROUPS) -> list[Group]:
+def groups(key: Array, scenes: dict[str, Segments], problem: Problem, number: int = GROUPS) -> list[Group]:
     """`number` re-drawn groups of RATERS who passed the sanity check; each is shown SHOWN scenes of each method, drawn anew."""
     together = jax.tree.map(lambda *rows: jnp.stack(rows), *scenes.values())  # (methods, n, horizon, ...)
-    ratings = np.asarray(_groups(jax.random.split(key, number), together, config))
+    ratings = np.asarray(_groups(jax.random.split(key, number), together, problem))
     return [analyse(dict(zip(scenes, group.T, strict=True))) for group in ratings]
 
 
 @jax.jit
-def _groups(keys: Array, scenes: Segments, config: Config) -> Array:
+def _groups(keys: Array, scenes: Segments, problem: Problem) -> Array:
     """Mean ratings (groups, RATERS, methods) of `scenes` (methods, n, horizon, ...)."""
     methods, pool = scenes.mask.shape[:2]
 
@@ -88,6 +87,6 @@ def _groups(keys: Array, scenes: Segments, config: Config) -> Array:
         shown = jax.random.randint(key_show, (methods, SHOWN), 0, pool)
         drawn = jax.tree.map(lambda rows: jax.vmap(lambda row, which: row[which])(rows, shown), scenes)
         flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), drawn)
-        return rate(key_rate, raters, flat, config).reshape(RATERS, methods, SHOWN).mean(-1)
+        return rate(key_rate, raters, flat, problem).reshape(RATERS, methods, SHOWN).mean(-1)
 
     return jax.lax.map(one, keys)

@@ -14,9 +14,11 @@ import peps_envs
 from peps_envs.highway import Highway
 from peps_envs.highway.vehicle import LANE_WIDTH
 from peps_jax import rollout
-from peps_jax.config import Config
+from peps_jax.config import Config, Problem
+from peps_jax.preferences.data import Segments
+from peps_jax.settings import RolloutSettings
 from peps_jax.train import Result
-from peps_jax.trajectory import Segments, Trajectory
+from peps_jax.trajectory import Trajectory
 
 DRY, RAIN = "highway-dry", "highway-rain"
 HORIZON = Highway.horizon
@@ -41,28 +43,35 @@ def whole(trajectory: Trajectory) -> Segments:
     return Segments(
         observation=rows.transition.observation,
         action=rows.transition.action,
-        mask=jnp.where(jnp.cumsum(over, 1) - over > 0, 0.0, 1.0),
+        mask=jnp.cumsum(over, 1) - over == 0,
         state=rows.state,
         next_state=rows.next_state,
     )
 
 
-def watch(act: Callable[[Array, Array, Array], Array], config: Config, key: Array, number: int) -> Segments:
-    """`number` scenes of `config`'s world, whole: (number, horizon, ...), masked after a crash. `act` as in `rollout.collect`."""
-    config = config.replace(num_envs=number, rollout_length=HORIZON)
+def whole_scenes(number: int) -> RolloutSettings:
+    """Settings of `number` scenes side by side, from start to end."""
+    return RolloutSettings(num_envs=number, length=HORIZON, hold_steps=1, exploration=jnp.zeros((), jnp.float32))
+
+
+def watch(act: Callable[[Array, Array, Array], Array], problem: Problem, key: Array, number: int) -> Segments:
+    """`number` scenes of `problem`, whole: (number, horizon, ...), masked after a crash. `act` as in `rollout.collect`."""
     key_start, key_steps = jax.random.split(key)
-    _, trajectory, _ = rollout.collect(rollout.init(key_start, config), act, key_steps, config)
+    settings = whole_scenes(number)
+    _, trajectory, _ = rollout.collect(rollout.init(key_start, problem, settings), act, key_steps, problem, settings)
     return whole(trajectory)
 
 
 def watch_agent(result: Result, key: Array, number: int) -> Segments:
     """`number` scenes of a trained agent, which acts by its policy's mode."""
-    return watch(lambda observation, key, time: result.policy()(observation, None)[0], result.config, key, number)
+    return watch(
+        lambda observation, key, time: result.policy()(observation, None)[0], result.training.problem, key, number
+    )
 
 
 def crashed(scenes: Segments) -> Array:
     """(...,) bool: whether the ego crashes in what a scene, or a piece of one, shows."""
-    return jnp.any(scenes.next_state.vehicles.crashed[..., 0] & (scenes.mask > 0), -1)
+    return jnp.any(scenes.next_state.vehicles.crashed[..., 0] & scenes.mask, -1)
 
 
 def behaviour(scenes: Segments) -> Array:
@@ -73,7 +82,7 @@ def behaviour(scenes: Segments) -> Array:
     ego = jax.tree.map(lambda rows: rows[..., 0], scenes.next_state.vehicles)
     start = scenes.state.vehicles
     first = lambda happens: jnp.where(jnp.any(happens, 1), jnp.argmax(happens, 1), happens.shape[1])
-    seen = scenes.mask > 0
+    seen = scenes.mask
     slower = first((ego.speed < start.speed[:, :1, 0] - 2.0) & seen & ~ego.crashed)
     aside = first((jnp.abs(ego.y - start.y[:, :1, 0]) > 0.5) & seen)
     leaves = jnp.any((jnp.abs(ego.y - start.y[:, :1, 0]) > LANE_WIDTH / 2) & seen, 1)

@@ -1,0 +1,333 @@
+"""A training's program: initialised, advanced and evaluated for many cells at once, compiled once for each structure.
+
+Cells whose `Config`s differ only in traced leaves share a program; environments that share code do too, because their numbers
+are leaves.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from peps_jax import methods
+from peps_jax.config import Config
+from peps_jax.evaluate import Evaluation, evaluate
+from peps_jax.execution import compilation_cache, devices, memory
+from peps_jax.preferences import teachers
+from peps_jax.preferences.data import PreferenceSet
+from peps_jax.train import Result, TrainingState, finish, init, prepare, run_round, run_rounds
+
+REPORTS = 40  # chunks of rounds that a training is about cut into: progress, and a place to stop, between two of them
+
+
+@struct.dataclass
+class FinishedRun(Result):
+    """A training that is done and evaluated, as numpy arrays."""
+
+    evaluation: Evaluation | None = None
+    failed: bool = struct.field(pytree_node=False, default=False)  # something learned or evaluated isn't finite
+
+
+class Times(NamedTuple):
+    """Seconds of wall clock."""
+
+    compile: float = 0.0
+    run: float = 0.0  # training, after compilation
+    evaluate: float = 0.0
+
+    def __add__(self, other: Times) -> Times:
+        return Times(*(a + b for a, b in zip(self, other, strict=True)))
+
+
+class Progress(NamedTuple):
+    """A batch between two rounds, as numpy arrays: all that it takes to go on, in another process too."""
+
+    rounds: int  # done
+    state: TrainingState  # every leaf (cells, ...); random keys as their data
+    curves: dict[str, np.ndarray]  # (cells, rounds) each
+    seconds: float  # of training so far
+
+
+Report = Callable[
+    [int, dict[str, np.ndarray], Callable[[], Progress]], None
+]  # rounds done, curves (cells, rounds of the chunk), and what makes the batch's `Progress`
+
+
+# --- what one cell's training is made of ------------------------------------------------------------------------------------
+
+
+def shared(config: Config) -> Config:
+    """`config` with its task's code and numbers in place of names, so that environments which share code share a program."""
+    problem = config.problem()
+    return config.replace(env=problem.environment, params=problem.params, belief=problem.belief)
+
+
+def structure(config: Config) -> Any:
+    """What decides which program a cell needs: equal for cells that differ only in the values of traced leaves."""
+    leaves, tree = jax.tree.flatten(shared(config))
+    return tree, tuple(jnp.shape(leaf) for leaf in leaves)
+
+
+def written(config: Config, *more: Any) -> str | None:
+    """`structure` as text, for another process to recognise; None if code decides it that isn't this project's."""
+    cell = shared(config)
+    ours = [type(cell.env), *(part for part in methods.get(cell.method) if callable(part))]
+    if any(part.__module__.split(".")[0] not in ("peps_jax", "peps_envs") for part in ours):
+        return None
+    leaves, tree = jax.tree.flatten(cell)
+    return repr([tree, [(jnp.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves], *more])
+
+
+def stack(cells: Sequence[Config]) -> Config:
+    """One `Config` whose every leaf has a leading axis of cells."""
+    return devices.stack([shared(cell) for cell in cells])
+
+
+def begin(cell: Config, recorded: PreferenceSet | None = None) -> TrainingState:
+    """The state before the first round, whether or not anything was recorded before."""
+    teacher = teachers.SYNTHETIC if recorded is None else teachers.recorded(recorded)
+    return init(prepare(cell, teacher), teacher)
+
+
+def advance(state: TrainingState, indices: jax.Array, cell: Config) -> Any:
+    """Rounds `indices`: state and curves. The same program whether or not anything was recorded before."""
+    return run_rounds(state, indices, prepare(cell))
+
+
+def score(state: TrainingState, cell: Config, num_episodes: int) -> Evaluation:
+    """The evaluation of what was learned."""
+    return evaluate(finish(state, {}, prepare(cell)), num_episodes)
+
+
+def empty_progress(cell: Config, cells: int, recorded: PreferenceSet | None = None) -> TrainingState:
+    """Shapes and types of the state of a `Progress` of `cells` cells like `cell`."""
+    shapes = jax.eval_shape(lambda cell: _key_data(begin(cell, recorded)), shared(cell))
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((cells, *leaf.shape), leaf.dtype), shapes)
+
+
+def empty_finished(cell: Config, num_episodes: int) -> tuple[TrainingState, Evaluation]:
+    """Shapes and types of what a training like `cell` and its evaluation leave, curves apart."""
+
+    def finished(cell: Config) -> tuple[TrainingState, Evaluation]:
+        state = begin(cell)
+        return state, score(state, cell, num_episodes)
+
+    return jax.eval_shape(finished, shared(cell))
+
+
+def memory_need(config: Config, num_episodes: int, recorded: PreferenceSet | None = None) -> memory.Need:
+    """Predicts a cell's bytes from shapes alone, without compiling.
+
+    `state` is exact: agent, knowledge, preferences, replay and actors, by `jax.eval_shape` of `begin`. `working` walks the traced
+    program of a round (and of the evaluation) and takes the largest sum of values that are in use at the same time, as if
+    every operation wrote its result to memory, elementwise ones in place where they can. Measured against programs
+    compiled for a CPU, `bytes_needed` of it is 1 to 14 % more than XLA reports (sac and peps, widths 32 to 256, minibatches
+    of 64 and 256), and up to 23 % more where a chunk is a single round. Most of it are the minibatches of a round,
+    updates_per_round * batch_size transitions.
+    """
+    about = written(config, "memory", num_episodes, _shapes_of(recorded))
+    return compilation_cache.kept(about, lambda: {"need": _memory_need(config, num_episodes, recorded)})["need"]
+
+
+def _memory_need(config: Config, num_episodes: int, recorded: PreferenceSet | None) -> memory.Need:
+    cell, indices = shared(config), jnp.zeros(1, jnp.int32)
+    one_round = lambda state, cell: run_round(state, indices[0], prepare(cell))
+    try:
+        state = jax.eval_shape(lambda cell: begin(cell, recorded), cell)
+        programs = [
+            jax.make_jaxpr(one_round)(state, cell),
+            jax.make_jaxpr(lambda state, cell: score(state, cell, num_episodes))(state, cell),
+        ]
+    except OverflowError:  # sizes that an index can't count
+        return memory.Need(state=2**63, working=0)
+    return memory.Need(
+        state=sum(memory.size_of(leaf) for leaf in jax.tree.leaves(state)),
+        working=max(memory.most_in_use(program.jaxpr) for program in programs),
+    )
+
+
+# --- programs -------------------------------------------------------------------------------------------------------------
+
+
+def chunk_lengths(num_rounds: int) -> list[int]:
+    """Rounds between two reports, summing to `num_rounds`; of at most two different lengths, since each is a program.
+
+    A length that divides `num_rounds` is taken unless it makes many more chunks than `REPORTS`.
+    """
+    longest = max(1, num_rounds // REPORTS)
+    divisor = next(length for length in range(longest, 0, -1) if num_rounds % length == 0)
+    length = divisor if 4 * divisor >= longest else longest
+    rest = num_rounds % length
+    return [length] * (num_rounds // length) + [rest] * (rest > 0)
+
+
+class Program:
+    """A structure's training and evaluation, compiled for a number of cells on some devices.
+
+    Args:
+      cell: any with the structure.
+      slots: cells that it has room for.
+      recorded: preferences that were given before, the same for every cell.
+    """
+
+    def __init__(
+        self,
+        cell: Config,
+        slots: int,
+        num_episodes: int,
+        used: Sequence[jax.Device],
+        recorded: PreferenceSet | None = None,
+    ):
+        self._cell, self._slots, self._num_episodes, self._recorded = cell, slots, num_episodes, recorded
+        self._devices, self._sharding = tuple(used), devices.sharding(used)
+        self._chunks = chunk_lengths(cell.num_rounds)
+        self._compiled: dict[str, Any] = {}
+
+    def compile(self) -> float:
+        """Compiles, or takes what was compiled before; returns the seconds that it took."""
+        start = time.perf_counter()
+        about = written(self._cell, self._slots, self._num_episodes, _shapes_of(self._recorded))
+        self._compiled = compilation_cache.kept(about, self._compile, self._devices)
+        return time.perf_counter() - start
+
+    def _compile(self) -> dict[str, Any]:
+        """The programs by name."""
+        cells = self._shapes(stack([self._cell] * self._slots))
+        recorded = self._recorded
+        state = self._shapes(jax.eval_shape(jax.vmap(begin, in_axes=(0, None)), cells, recorded))
+        over = lambda function, **which: devices.over_devices(function, self._devices, **which)
+        further = over(advance, whole=(1,), donate=(0,))
+        indices = lambda length: jax.ShapeDtypeStruct((length,), jnp.int32)
+        evaluation = lambda state, cell: score(state, cell, self._num_episodes)
+        lowered = {
+            "init": over(begin, whole=(1,)).lower(cells, recorded),
+            "evaluate": over(evaluation).lower(state, cells),
+            **{
+                f"{length} rounds": further.lower(state, indices(length), cells) for length in sorted(set(self._chunks))
+            },
+        }
+        with ThreadPoolExecutor() as pool:  # the compiler works outside Python's lock
+            compiled = pool.map(lambda program: program.compile(), lowered.values())
+            return dict(zip(lowered, compiled, strict=True))
+
+    @property
+    def bytes_used(self) -> int:
+        """Of a device at most, as XLA reports it: arguments, results and what is in use between them."""
+        figures = [compiled.memory_analysis() for name, compiled in self._compiled.items() if name != "init"]
+        return max(
+            one.argument_size_in_bytes + one.output_size_in_bytes - one.alias_size_in_bytes + one.temp_size_in_bytes
+            for one in figures
+        )
+
+    def _shapes(self, tree: Any) -> Any:
+        return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=self._sharding), tree)
+
+    def run(
+        self, cells: Sequence[Config], report: Report = lambda *_: None, start: Progress | None = None
+    ) -> tuple[list[FinishedRun], Times]:
+        """Trains and evaluates `cells`, at most `slots`, and tells `report` after every chunk of rounds.
+
+        Args:
+          start: where an earlier run of the same cells was; the numbers are those of a run without a break.
+        """
+        number = len(cells)
+        leaves = jax.device_put(stack(devices.padded(cells, self._slots)), self._sharding)
+        began = time.perf_counter()
+        if start is None:
+            state, done, chunks, earlier = self._compiled["init"](leaves, self._recorded), 0, [], 0.0
+        else:
+            state, done, chunks, earlier = self._resumed(start), start.rounds, [start.curves], start.seconds
+        for length in self._chunks[self.chunks_in(done) :]:
+            indices = jnp.arange(done, done + length, dtype=jnp.int32)
+            state, curves = self._compiled[f"{length} rounds"](state, indices, leaves)
+            chunks.append({name: values[:number] for name, values in jax.device_get(curves).items()})
+            done += length
+
+            def snapshot(state: TrainingState = state, done: int = done) -> Progress:
+                seconds = earlier + time.perf_counter() - began
+                return Progress(done, _on_host(state, number), _joined(chunks), seconds)
+
+            report(done, chunks[-1], snapshot)
+        trained = time.perf_counter()
+        evaluations = jax.device_get(self._compiled["evaluate"](state, leaves))
+        learned = jax.device_get((state.agents, state.knowledge, state.preferences))
+        times = Times(run=earlier + trained - began, evaluate=time.perf_counter() - trained)
+        rows = (*learned, _joined(chunks), evaluations)
+        own = lambda place: jax.tree.map(lambda values: values[place], rows)
+        return [self._finished(cell, *own(place)) for place, cell in enumerate(cells)], times
+
+    def _finished(self, cell: Config, agents: Any, knowledge: Any, preferences: Any, curves: Any, evaluation: Any):
+        return FinishedRun(
+            training=prepare(cell),
+            agents=agents,
+            knowledge=knowledge,
+            preferences=preferences,
+            curves=curves,
+            evaluation=evaluation,
+            failed=not _finite((agents, knowledge, evaluation)),
+        )
+
+    def chunks_in(self, rounds: int) -> int:
+        """How many chunks `rounds` are. Raises ValueError if none ends there."""
+        ends = np.cumsum([0, *self._chunks])
+        if rounds not in ends:
+            raise ValueError(f"rounds {rounds} end no chunk: chunks end at {', '.join(map(str, ends))}")
+        return int(np.flatnonzero(ends == rounds)[0])
+
+    def _resumed(self, start: Progress) -> TrainingState:
+        """`start`'s state on the devices."""
+        places = np.asarray(devices.padded(range(len(jax.tree.leaves(start.state)[0])), self._slots))
+        shapes = jax.eval_shape(lambda cell: begin(cell, self._recorded), shared(self._cell))
+        keys = lambda leaf, shape: jax.random.wrap_key_data(leaf) if _is_key(shape) else leaf
+        state = jax.tree.map(keys, jax.tree.map(lambda leaf: leaf[places], start.state), shapes)
+        return jax.device_put(state, self._sharding)
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _key_data(state: TrainingState) -> TrainingState:
+    return jax.tree.map(lambda leaf: jax.random.key_data(leaf) if _is_key(leaf) else leaf, state)
+
+
+def _on_host(state: TrainingState, number: int) -> TrainingState:
+    """The first `number` cells of `state` as numpy arrays."""
+    return jax.tree.map(lambda leaf: np.array(leaf[:number]), jax.device_get(_key_data(state)))
+
+
+def _joined(chunks: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    return jax.tree.map(lambda *parts: np.concatenate(parts, 1), *chunks)
+
+
+def _finite(tree: Any) -> bool:
+    return all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(tree) if np.issubdtype(leaf.dtype, np.floating))
+
+
+def _shapes_of(recorded: PreferenceSet | None) -> list[Any]:
+    return [(jnp.shape(leaf), str(jnp.result_type(leaf))) for leaf in jax.tree.leaves(recorded)]
+
+
+_PROGRAMS: dict[Any, Program] = {}  # compiled in this process, as `jax.jit` keeps its own
+
+
+def program(
+    cell: Config,
+    slots: int,
+    num_episodes: int,
+    used: tuple[jax.Device, ...],
+    recorded: PreferenceSet | None = None,
+) -> tuple[Program, Times]:
+    """The compiled program for cells like `cell`, and what it took: nothing if it was compiled before in this process."""
+    key = structure(cell), slots, used, num_episodes, id(recorded)
+    if key in _PROGRAMS:
+        return _PROGRAMS[key], Times()
+    _PROGRAMS[key] = Program(cell, slots, num_episodes, used, recorded)
+    return _PROGRAMS[key], Times(compile=_PROGRAMS[key].compile())

@@ -1,0 +1,64 @@
+"""A round as a value: what differs from one to the next, made in one place."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from peps_jax.settings import ScheduleSettings
+
+
+class RoundKeys(NamedTuple):
+    """Random keys of a round, by purpose."""
+
+    act: Array
+    ask: Array
+    answer: Array
+    learn: Array
+    improve: Array
+
+
+class Round(NamedTuple):
+    """One round of a training."""
+
+    index: Array  # () int32, from 0
+    keys: RoundKeys
+    explores_only: Array  # () bool: every action is random
+    position: Array  # () int32, of this round's first transition in replay
+    filled: Array  # () int32, transitions in replay when this round's are there
+    temperature: Array  # () SAC's own, in reward units
+    learning_rate: Array  # () SAC's
+
+
+def round_at(index: Array, key: Array, schedule: ScheduleSettings) -> Round:
+    """Round `index` of the training whose key is `key`. It depends on nothing else: both halves of a round see the same."""
+    position = index * schedule.steps_per_round
+    return Round(
+        index=index,
+        keys=RoundKeys(*jax.random.split(jax.random.fold_in(key, index), len(RoundKeys._fields))),
+        explores_only=index < schedule.warmup_rounds,
+        position=position,
+        filled=position + schedule.steps_per_round,
+        temperature=annealed_temperature(index, schedule),
+        learning_rate=faded_learning_rate(index, schedule),
+    )
+
+
+def annealed_temperature(index: Array, schedule: ScheduleSettings) -> Array:
+    """From `initial_temperature` to `temperature`, geometrically, over `anneal_share` of the rounds."""
+    done = jnp.clip(index / jnp.maximum(schedule.anneal_share * schedule.num_rounds, 1.0), 0.0, 1.0)
+    first, last = jnp.maximum(schedule.initial_temperature, 1e-6), jnp.maximum(schedule.temperature, 1e-6)
+    return jnp.exp((1 - done) * jnp.log(first) + done * jnp.log(last)).astype(jnp.float32)
+
+
+def faded_learning_rate(index: Array, schedule: ScheduleSettings) -> Array:
+    """Whole at first, then falling linearly to a tenth at the end.
+
+    Late in a training a full step trades one of two nearly equal ways for the other.
+    """
+    left = 1 - index / schedule.num_rounds
+    share = jnp.clip(left / jnp.maximum(schedule.fade_share, 1e-6), 0.1, 1.0)
+    return (schedule.learning_rate * share).astype(jnp.float32)
