@@ -20,7 +20,9 @@ def embedded(text: str) -> str:
 
     def replace(match: re.Match) -> str:
         folder = match[1].rpartition("/")[0]
-        content = re.sub(r"\]\((?=[^)/]+\.png\))", f"]({folder}/", (ROOT / match[1]).read_text().strip())
+        content = re.sub(
+            r"\]\((?=[^)/]+\.png\))", f"]({folder}/", (ROOT / match[1]).read_text(encoding="utf-8").strip()
+        )
         return f"<!-- begin {match[1]} -->\n{content}\n<!-- end -->"
 
     return re.sub(r"<!-- begin (\S+) -->\n.*?<!-- end -->", replace, text, flags=re.DOTALL)
@@ -28,4 +30,4 @@ def embedded(text: str) -> str:
 
 if __name__ == "__main__":
     for page in PAGES:
-        page.write_text(embedded(page.read_text()))
+        page.write_text(embedded(page.read_text(encoding="utf-8")), encoding="utf-8")

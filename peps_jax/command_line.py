@@ -3,13 +3,39 @@
 from __future__ import annotations
 
 import argparse
+import codecs
 import difflib
+import io
 import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
+REPLACED = "peps_jax.replaced"  # how what a terminal can't show is written
+SUBSTITUTES = {"±": "+-", "–": "-", "—": "-", "λ": "lambda", "…": "..."}
 FORCED_DEVICES = "--xla_force_host_platform_device_count"
+
+
+def print_whatever_can_be_shown() -> None:
+    """From now on stdout and stderr replace what their encoding doesn't have, where they would have raised an error."""
+    codecs.register_error(REPLACED, _substitute)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # None where there is no such stream
+            stream.reconfigure(errors=REPLACED)
+
+
+def _substitute(error: UnicodeError) -> tuple[bytes, int]:
+    """What is written in place of the characters that `error` is about, and where to go on."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    return b"".join(map(_shown_byte_by_byte, error.object[error.start : error.end])), error.end
+
+
+def _shown_byte_by_byte(character: str) -> bytes:
+    """A byte of a file's name as it is (Python keeps those that are no text as surrogates); what reads like the rest, or '?'."""
+    if "\udc80" <= character <= "\udcff":
+        return character.encode("utf-8", "surrogateescape")
+    return SUBSTITUTES.get(character, "?").encode("ascii")
 
 
 def refuse(prog: str, error: Exception | str) -> int:

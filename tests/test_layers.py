@@ -69,7 +69,7 @@ def imported(path: Path, module: str, modules: dict[str, Path]) -> set[str]:
     """The project's modules that `path` imports, anywhere in it: `from peps_jax import train` means peps_jax.train."""
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -107,7 +107,7 @@ def plant(root: Path, file: str, text: str) -> None:
         empty = root / path.relative_to(ROOT)
         empty.parent.mkdir(parents=True, exist_ok=True)
         empty.touch()
-    (root / file).write_text(text)
+    (root / file).write_text(text, encoding="utf-8")
 
 
 def test_no_arrow_runs_upwards():
@@ -182,7 +182,7 @@ def test_modules_are_named_for_what_they_are_about():
 
 def test_importing_the_library_imports_neither_brax_nor_matplotlib():
     program = "import sys, peps_envs, peps_jax; print(*({'brax', 'matplotlib'} & set(sys.modules)))"
-    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, encoding="utf-8", check=True).stdout
     assert not printed.split()
 
 
@@ -199,5 +199,7 @@ peps_jax.command_line.use_every_core()
 print(jax.device_count())
 """
     environment = {**os.environ, "XLA_FLAGS": ""}
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env=environment)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, encoding="utf-8", check=True, env=environment
+    )
     assert done.stdout.split() == ["3"]

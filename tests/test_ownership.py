@@ -61,7 +61,7 @@ ACTS = {
     "a file": lambda folder: files.write_whole(folder / "file", b"late"),
     "a new file": lambda folder: files.write_whole(folder / "inner" / "new", b"late"),
     "a file that something else makes": lambda folder: files.write_with(
-        folder / "file", lambda path: path.write_text("late")
+        folder / "file", lambda path: path.write_text("late", encoding="utf-8")
     ),
     "a folder": lambda folder: files.write_folder(folder / "inner", lambda inner: (inner / "late").touch()),
     "a new folder": lambda folder: files.make_folder(folder / "new" / "newer"),
@@ -214,7 +214,7 @@ def test_commands_write_through_files_alone():
     past = {"write_text", "write_bytes", "savefig", "unlink", "rmtree", "mkdir", "rmdir", "animate", "film", "dump"}
     package = Path(peps_jax.__file__).parent
     for path in [*(package / "sweep").rglob("*.py"), *(package / "reproduce").rglob("*.py")]:
-        tree = ast.parse(path.read_text())
+        tree = ast.parse(path.read_text(encoding="utf-8"))
         named = lambda call: call.func.attr if isinstance(call.func, ast.Attribute) else ""
         calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
         inside = {inner for call in calls if named(call) == "write_with" for inner in ast.walk(call)}
@@ -433,7 +433,7 @@ def compiled(tmp_path_factory):
 
 def start(environment, *arguments: object) -> subprocess.Popen:
     words = [sys.executable, "-m", "peps_jax.sweep", *map(str, arguments)]
-    return subprocess.Popen(words, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return subprocess.Popen(words, env=environment, encoding="utf-8", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
 @pytest.mark.slow

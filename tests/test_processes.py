@@ -66,7 +66,7 @@ def test_processes_divide_the_cells(team, tmp_path):
     assert call(*LINE, "--out", tmp_path / "one") == 0
     assert run_together(tmp_path / "three", [0, 1, 2], 3, *LINE) == {0: 0, 1: 0, 2: 0}
     assert contents(tmp_path / "three") == contents(tmp_path / "one")
-    manifest = json.loads((tmp_path / "three" / results.MANIFEST).read_text())
+    manifest = json.loads((tmp_path / "three" / results.MANIFEST).read_text(encoding="utf-8"))
     assert manifest["status"] == "complete"
     assert manifest["env_steps"] == 8 * 160
 
@@ -77,9 +77,9 @@ def test_a_process_that_never_comes_is_said_and_the_others_are_kept(team, tmp_pa
     error = capsys.readouterr().err
     assert "process 1 didn't finish: no sign of life" in error
     assert f"6 of 8 cells are finished and kept in {folder}; continue with: " in error
-    with open(folder / results.TABLE, newline="") as file:
+    with open(folder / results.TABLE, newline="", encoding="utf-8") as file:
         assert len(list(csv.DictReader(file))) == 6
-    assert json.loads((folder / results.MANIFEST).read_text())["status"] == "interrupted"
+    assert json.loads((folder / results.MANIFEST).read_text(encoding="utf-8"))["status"] == "interrupted"
     assert run_together(folder, [0, 1], 2, "--resume") == {0: 0, 1: 0}, "by other processes, too"
     assert call(*LINE, "--out", tmp_path / "one") == 0
     assert contents(folder) == contents(tmp_path / "one")
@@ -131,7 +131,9 @@ def test_two_processes_have_the_numbers_of_one(tmp_path):
     def start(*more: str) -> subprocess.Popen:
         command = [sys.executable, "-m", "peps_jax.sweep", *flags, *more]
         environment = os.environ | cache | one_device
-        return subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        return subprocess.Popen(
+            command, env=environment, encoding="utf-8", stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
 
     coordinator = f"localhost:{free_port()}"
     together = ("--out", str(tmp_path / "two"), "--coordinator", coordinator, "--processes", "2")
@@ -143,7 +145,7 @@ def test_two_processes_have_the_numbers_of_one(tmp_path):
     _, error = one.communicate(timeout=600)
     assert one.returncode == 0, error
     assert contents(tmp_path / "two") == contents(tmp_path / "one")
-    with open(tmp_path / "two" / results.TABLE, newline="") as file:
+    with open(tmp_path / "two" / results.TABLE, newline="", encoding="utf-8") as file:
         assert [int(row["seed"]) for row in csv.DictReader(file)] == list(range(8)), "every cell once"
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 README = Path(__file__).parents[1] / "README.md"
-BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
+BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
 @pytest.mark.slow
@@ -25,4 +25,4 @@ def test_tables_are_the_measured_ones():
     spec.loader.exec_module(module)
     assert README in module.PAGES
     for page in module.PAGES:
-        assert module.embedded(page.read_text()) == page.read_text()
+        assert module.embedded(page.read_text(encoding="utf-8")) == page.read_text(encoding="utf-8")

@@ -82,7 +82,7 @@ def test_bad_input_is_one_line(arguments, parts, tmp_path, capsys, monkeypatch):
 
 @pytest.mark.parametrize("file", [results.MANIFEST, results.TABLE])
 def test_a_folder_with_results_is_not_written(file, tmp_path, capsys):
-    (tmp_path / file).write_text("precious")
+    (tmp_path / file).write_text("precious", encoding="utf-8")
     assert call(["--out", str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
@@ -127,7 +127,7 @@ def test_importing_the_library_meets_no_device():
         "import sys, peps_jax.sweep; from jax._src import xla_bridge; "
         "print(xla_bridge.backends_are_initialized(), 'matplotlib' in sys.modules)"
     )
-    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, encoding="utf-8", check=True).stdout
     assert printed.split() == ["False", "False"]
 
 
@@ -213,14 +213,14 @@ def swept(tmp_path_factory, tiny):
 
 
 def table(folder) -> list[dict[str, str]]:
-    with open(folder / results.TABLE, newline="") as file:
+    with open(folder / results.TABLE, newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
 @pytest.mark.slow
 def test_a_sweep_writes_the_whole_grid(swept):
     rows = table(swept)
-    manifest = json.loads((swept / results.MANIFEST).read_text())
+    manifest = json.loads((swept / results.MANIFEST).read_text(encoding="utf-8"))
     assert [(row["method"], float(row["lam"]), int(row["seed"])) for row in rows] == [
         (method, lam, seed) for method in ("peps", "sac") for lam in (1.0, 2.4) for seed in (3, 4)
     ]
@@ -327,8 +327,8 @@ def test_a_folder_without_results_is_said(tmp_path):
 
 def test_an_interrupted_sweep_keeps_what_is_finished(line, line_task, tmp_path, capsys, monkeypatch):
     for name in (results.TABLE, results.PICTURES[0]):
-        (tmp_path / name).write_text("an earlier run's")
-    (tmp_path / "notes.txt").write_text("mine")
+        (tmp_path / name).write_text("an earlier run's", encoding="utf-8")
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     compiled, asked = batches.program, []
 
     def interrupt_the_second(*arguments):
@@ -344,9 +344,9 @@ def test_an_interrupted_sweep_keeps_what_is_finished(line, line_task, tmp_path, 
     assert [row["cell"] for row in table(tmp_path)] == [
         f"line-sac-lam{lam}-seed{seed}" for lam in (1.0, 2.4) for seed in (0, 1)
     ]
-    assert json.loads((tmp_path / results.MANIFEST).read_text())["status"] == "interrupted"
+    assert json.loads((tmp_path / results.MANIFEST).read_text(encoding="utf-8"))["status"] == "interrupted"
     assert peps_jax.load(tmp_path, 1).act(jnp.zeros(1)).shape == (1,)
-    assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert (tmp_path / "notes.txt").read_text(encoding="utf-8") == "mine"
     assert not (tmp_path / results.PICTURES[0]).exists()
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from peps_envs.registry import unknown_name
-from peps_jax.command_line import Parser, options, refuse, use_every_core
+from peps_jax.command_line import Parser, options, print_whatever_can_be_shown, refuse, use_every_core
 from peps_jax.config import Config
 from peps_jax.reproduce import figures, tables
 from peps_jax.reproduce.driving import figure3
@@ -131,6 +131,7 @@ def main(arguments: Sequence[str] | None = None, base: Config | None = None, num
       base: settings of every training; the package's defaults by default.
       num_episodes: rollouts of each training.
     """
+    print_whatever_can_be_shown()
     use_every_core()
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
@@ -153,7 +154,7 @@ def main(arguments: Sequence[str] | None = None, base: Config | None = None, num
         wanted.store.close()
     for path in written:
         if path.suffix == ".md":
-            print(path.read_text())
+            print(path.read_text(encoding="utf-8"))
     print(f"in {wanted.store.folder}: {', '.join(path.name for path in written)}")
     return 0
 

@@ -207,7 +207,7 @@ def grid(settings: Mapping[str, Any]) -> tuple[list[Cell], dict[str, Config]]:
 def _stored(out: Path) -> tuple[dict[str, Any] | None, str]:
     """The settings of the sweep in `out`, None if there is none, and its command. Raises ValueError if they can't be read."""
     try:
-        manifest = json.loads((out / results.MANIFEST).read_text())
+        manifest = json.loads((out / results.MANIFEST).read_text(encoding="utf-8"))
         return results.tuples(manifest["configuration"]), manifest["command"]
     except (FileNotFoundError, NotADirectoryError):
         return None, ""

@@ -15,6 +15,7 @@ and ends with exit code 2. A sweep all of whose cells failed ends with exit code
 from __future__ import annotations
 
 import contextlib
+import os
 import shlex
 import signal
 import sys
@@ -22,7 +23,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from peps_jax.command_line import refuse, use_every_core
+from peps_jax.command_line import print_whatever_can_be_shown, refuse, use_every_core
 from peps_jax.execution import checkpoints
 from peps_jax.storage import files, ownership
 from peps_jax.sweep import journal, results, workers
@@ -48,6 +49,7 @@ def terminable() -> Iterator[threading.Event]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code."""
+    print_whatever_can_be_shown()
     use_every_core()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
@@ -57,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         by_hand = (wanted.running[name] for name in ("coordinator", "processes", "process"))
         distributed = wanted.running["distributed"] or wanted.running["coordinator"]
         team = workers.join(*by_hand) if distributed else workers.alone()
-        sweep = Sweep(wanted, wanted.begun_by or shlex.join([*PROG.split(), *arguments]), team)
+        sweep = Sweep(wanted, wanted.begun_by or _as_text(shlex.join([*PROG.split(), *arguments])), team)
         sweep.begin()
     except (ValueError, files.NotWrittenError) as error:
         return refuse(PROG, error)
@@ -69,6 +71,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _run(sweep, wanted, team)
     except ownership.OwnershipLostError as error:
         return refuse(PROG, error)
+
+
+def _as_text(command: str) -> str:
+    """A command as UTF-8 has it: a locale that knows ASCII alone took its words for bytes."""
+    return os.fsencode(command).decode("utf-8", "surrogateescape")
 
 
 def _run(sweep: Sweep, wanted: Request, team: workers.Team) -> int:

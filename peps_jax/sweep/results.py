@@ -84,7 +84,7 @@ def check_free(folder: Path) -> None:
 def is_complete(folder: Path) -> bool:
     """Whether the sweep in `folder` has nothing left to do."""
     try:
-        return json.loads((folder / MANIFEST).read_text()).get("status") == "complete"
+        return json.loads((folder / MANIFEST).read_text(encoding="utf-8")).get("status") == "complete"
     except (OSError, ValueError):
         return False
 
@@ -248,7 +248,7 @@ def load(folder: str | os.PathLike[str], cell: int | str | Mapping[str, Any]) ->
     """
     folder = Path(folder)
     try:
-        manifest = json.loads((folder / MANIFEST).read_text())
+        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
         cells, configuration = manifest["cells"], manifest["configuration"]
     except (OSError, ValueError, KeyError):
         raise ValueError(f"folder {str(folder)!r} holds no sweep's results: {MANIFEST} is missing or broken") from None

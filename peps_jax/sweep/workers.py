@@ -68,7 +68,7 @@ def join(coordinator: str | None = None, count: int | None = None, index: int | 
     # A child of its own, because a process that was once part of a distributed JAX counts the others' devices for ever.
     environment = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": ""}
     child = subprocess.run(
-        [sys.executable, "-m", "peps_jax.sweep.workers", asked], capture_output=True, text=True, env=environment
+        [sys.executable, "-m", "peps_jax.sweep.workers", asked], capture_output=True, encoding="utf-8", env=environment
     )
     last = child.stdout.strip().splitlines()[-1:]
     if child.returncode or not last:
@@ -181,7 +181,7 @@ class Others:
     def _told(self, index: int) -> dict[str, Any]:
         nothing = {"status": RUNNING, "beat": 0, "run": self._team.run, "reason": ""}
         try:
-            told = json.loads(_path(self._folder, index).read_text())
+            told = json.loads(_path(self._folder, index).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return nothing
         return told if told["run"] == self._team.run else nothing  # an earlier run's

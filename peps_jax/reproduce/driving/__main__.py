@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from peps_jax.command_line import Parser, options, refuse, use_every_core
+from peps_jax.command_line import Parser, options, print_whatever_can_be_shown, refuse, use_every_core
 from peps_jax.reproduce.driving import experiment, report
 from peps_jax.storage.files import NotWrittenError, check_writable
 from peps_jax.storage.ownership import Owner
@@ -92,6 +92,7 @@ def request(arguments: Sequence[str]) -> Request:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code."""
+    print_whatever_can_be_shown()
     use_every_core()
     try:
         wanted = request(sys.argv[1:] if arguments is None else arguments)
@@ -109,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return refuse(PROG, error)
     finally:
         owner.release()
-    print((wanted.out / report.TABLE).read_text())
+    print((wanted.out / report.TABLE).read_text(encoding="utf-8"))
     print(f"in {wanted.out}: {', '.join(path.name for path in written)}")
     return 0
 
