@@ -75,9 +75,9 @@ def lines_of(path) -> list[dict[str, str]]:
         ("tabel1", ("result 'tabel1'", "did you mean 'table1'")),
         ("--seeds 1", ("seeds 1", "choose 2 to")),
         ("--seeds few", ("--seeds", "'few' is not a whole number")),
-        ("--steps 0", ("total_steps 0", "from 1 on")),
+        ("--steps 0", ("total_steps 0", "from 1 to")),
         ("--step 3", ("'--step'", "did you mean --steps?")),
-        ("--steps 100000000000000", ("needs about", "lower total_steps")),
+        ("--steps 2000000000", ("needs about", "lower total_steps")),
     ],
 )
 def test_bad_input_is_one_line(arguments, parts, tmp_path, capsys, tiny, no_training):

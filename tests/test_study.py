@@ -226,7 +226,7 @@ def test_the_studys_lambda_has_all_seeds_and_others_few():
         ("--seeds 0", ("seeds 0", "choose 1 to")),
         ("--seeds few", ("--seeds", "'few' is not a whole number")),
         ("--seed -1", ("seed -1", "choose 0 to")),
-        ("--steps 0", ("total_steps 0", "from 1 on")),
+        ("--steps 0", ("total_steps 0", "from 1 to")),
         ("--lams 1 -2", ("lams -2", "choose 0 or more")),
         ("--lams nan", ("lams nan", "choose 0 or more")),
         ("--lam 2", ("'--lam'", "did you mean --lams?")),

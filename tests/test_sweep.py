@@ -59,7 +59,7 @@ def refuse_to_compile(*arguments):
         ("--lam nan", ("lam nan", "0 or more")),
         ("--lam much", ("--lam", "'much' is not a number", "2.4")),
         ("--num-envs 2.5", ("--num-envs", "'2.5' is not a whole number")),
-        ("--num-envs 0", ("num_envs 0", "from 1 on")),
+        ("--num-envs 0", ("num_envs 0", "from 1 to")),
         ("--hidden-sizes 64 0", ("hidden_sizes (64, 0)",)),
         ("--segment-length 30 --rollout-length 20", ("segment_length 30", "rollout_length is 20")),
         ("--gamma 1.5", ("gamma 1.5", "from 0 to 1")),
@@ -69,8 +69,9 @@ def refuse_to_compile(*arguments):
         ("--num-env 3", ("'--num-env'", "did you mean --num-envs?")),
         ("--lam", ("--lam", "expected at least one")),
         ("nav-d1", ("'nav-d1' is unknown",)),
-        ("--total-steps 100000000000000", ("needs about", "lower total_steps")),
-        ("--batch-size 10000000000", ("needs about", "batch_size")),
+        ("--total-steps 100000000000000", ("total_steps 100000000000000", "from 1 to")),
+        ("--total-steps 2000000000", ("needs about", "lower total_steps")),
+        ("--batch-size 1000000000", ("needs about", "batch_size")),
     ],
 )
 def test_bad_input_is_one_line(arguments, parts, tmp_path, capsys, monkeypatch):
