@@ -6,11 +6,16 @@ import json
 import os
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from peps_jax import command_line
+from peps_jax.execution import batches, machine, waiting
+from peps_jax.execution.progress import Display
 
 ROOT = Path(__file__).parents[1]
 TINY = [
@@ -133,6 +138,96 @@ def test_a_sweep_needs_no_utf_8(environment, swept, tmp_path):
     for name in ("results.csv", "cells/nav-d1-sac-seed0.msgpack"):
         assert (tmp_path / "größe" / name).read_bytes() == (folder / name).read_bytes()
     assert "größe" in _command(tmp_path / "größe")
+
+
+# --- devices and waiting --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("module", ["peps_jax.sweep", "peps_jax.reproduce"])
+def test_an_accelerator_that_is_not_there_is_one_line(module, tmp_path):
+    nothing = {"JAX_PLATFORMS": "cuda", "CUDA_VISIBLE_DEVICES": ""}
+    done = run(module, "--out", tmp_path / "out", **nothing)
+    error = done.stderr.decode("utf-8")
+    assert done.returncode == 2
+    assert error.startswith(f"python -m {module}: error: JAX found no cuda device on ")
+    assert error.count("\n") == 1
+    assert "JAX_PLATFORMS is 'cuda'" in error
+    assert not (tmp_path / "out").exists()
+    assert run(module, "--help", **nothing).returncode == 0
+
+
+def test_a_driver_that_does_not_answer_is_said(monkeypatch, capsys):
+    answer = threading.Event()
+    monkeypatch.setattr(machine.jax, "devices", answer.wait)
+    monkeypatch.setattr(machine, "WAIT", 0.3)
+    monkeypatch.setattr(waiting, "EVERY", 0.2)
+    with pytest.raises(ValueError, match=r"JAX found no cpu device on .* in 0 s \(no answer\)"):
+        machine.meet_devices()
+    assert capsys.readouterr().err.startswith("waiting for JAX to find its devices on ")
+    answer.set()
+
+
+BROKEN = """
+import os
+def initialize():
+    os.write(2, b"I0000 00:00:17 stub.cc:31] Could not find drivers\\n")
+    raise RuntimeError("Unable to load CUDA. Is it installed?")
+"""
+
+
+@pytest.mark.parametrize(("platforms", "code"), [("cuda", 2), ("", 0)])
+def test_a_broken_plugin_is_one_line_unless_the_processor_will_do(platforms, code, tmp_path):
+    plugin = tmp_path / "jax_plugins" / "broken"
+    plugin.mkdir(parents=True)
+    (plugin / "__init__.py").write_text(BROKEN, encoding="utf-8")
+    program = "from peps_jax.execution import machine; machine.meet_devices()"
+    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = os.environ | {"JAX_PLATFORMS": platforms, "PYTHONPATH": path}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, cwd=ROOT, env=environment, check=False)
+    error = done.stderr.decode("utf-8")
+    assert "Unable to load CUDA. Is it installed?" in error
+    if code:
+        assert error.splitlines()[-1].startswith("ValueError: JAX found no cuda device on ")
+        assert "stub.cc" not in error
+    else:
+        assert done.returncode == 0
+        assert "stub.cc" in error
+
+
+def test_reminders_come_as_long_as_it_lasts(monkeypatch, capsys):
+    monkeypatch.setattr(waiting, "EVERY", 0.2)
+    with waiting.Reminder("thinking") as reminder:
+        time.sleep(0.5)
+        reminder.about(lambda: "doing")
+        time.sleep(0.3)
+    time.sleep(0.3)
+    assert capsys.readouterr().err.splitlines() == ["thinking, 0 s so far", "thinking, 0 s so far", "doing, 0 s so far"]
+
+
+def test_what_is_soon_done_has_no_reminder(capsys):
+    with waiting.Reminder("thinking"):
+        pass
+    assert capsys.readouterr().err == ""
+
+
+def test_long_compilation_rounds_and_evaluation_say_so(tiny, monkeypatch, capsys):
+    monkeypatch.setattr(waiting, "EVERY", 0.2)
+    batch = batches.Batch((0,), 1, ())
+    curves = {name: np.zeros((1, 2)) for name in ("episodes", "return_", "explicability")}
+    with Display([tiny], [batch]) as display:
+        display.compiling(batch)
+        time.sleep(0.3)
+        display.start(batch)
+        display.advanced(batch, 2, curves, None)
+        time.sleep(0.3)
+        display.advanced(batch, 4, curves, None)
+        time.sleep(0.3)
+    said = [line for line in capsys.readouterr().err.splitlines() if "so far" in line]
+    assert said == [
+        "compiling peps, 1 cells, 0 s so far",
+        "training peps, 1 cells: 2 rounds are done, the next ones take, 0 s so far",
+        "evaluating peps, 1 cells, 0 s so far",
+    ]
 
 
 def _command(folder: Path) -> str:

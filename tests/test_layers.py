@@ -33,7 +33,7 @@ LAYERS = (
     ("peps_jax.train", "peps_jax.rollout", "peps_jax.explicability"),
     ("peps_jax.evaluate",),
     ("peps_jax.analysis", "peps_jax.drawing"),
-    ("peps_jax.execution.memory", "peps_jax.execution.compilation_cache", "peps_jax.execution.machine"),
+    *(tuple(f"peps_jax.execution.{name}" for name in ("memory", "compilation_cache", "machine", "waiting")),),
     ("peps_jax.execution",),
     ("peps_jax.sweep",),
     ("peps_jax.reproduce",),

@@ -24,7 +24,7 @@ from peps_jax.reproduce.driving import report
 from peps_jax.reproduce.store import Record, Store
 from peps_jax.storage import files
 from peps_jax.storage.ownership import OWNER, Owner, OwnershipLostError, owners
-from peps_jax.sweep import command, journal, pictures, results, underway, workers
+from peps_jax.sweep import command, journal, meeting, pictures, results, underway, workers
 
 # a process that loses its folder inside one of Orbax's calls takes its threads with it; here they come back
 pytestmark = pytest.mark.filterwarnings("ignore:(?s).*Event loop is closed:pytest.PytestUnraisableExceptionWarning")
@@ -365,7 +365,8 @@ def test_a_sweep_that_stopped_is_copied_with_its_owner_and_continued(line_task, 
 
 def test_processes_of_one_sweep_lose_their_folder_together(line_task, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(workers, "BEAT", 0.05)
-    monkeypatch.setattr(workers, "join", lambda _, count, index: workers.Team(index, count, "these", count))
+    came = lambda place, wait: workers.Team(place.index, place.count, "these", place.count)
+    monkeypatch.setattr(meeting, "join", came)
     folder, after, advanced, door = tmp_path / "out", {}, underway.Keeper.advanced, threading.Barrier(2)
 
     def take_over(self, *arguments):

@@ -18,6 +18,7 @@ from typing import NamedTuple
 from peps_envs.registry import unknown_name
 from peps_jax.command_line import Parser, options, print_whatever_can_be_shown, refuse, use_every_core
 from peps_jax.config import Config
+from peps_jax.execution import machine
 from peps_jax.reproduce import figures, tables
 from peps_jax.reproduce.driving import figure3
 from peps_jax.reproduce.driving.experiment import STEPS
@@ -89,6 +90,7 @@ def request(arguments: Sequence[str], base: Config, num_episodes: int) -> Reques
       SystemExit: a flag that doesn't exist or can't be read (code 2), or --help (code 0).
     """
     values = parser().parse(arguments)
+    machine.meet_devices()
     for name in values.results:
         if name not in (*RESULTS, *GROUPS):
             raise ValueError(unknown_name("result", name, (*RESULTS, *GROUPS)))

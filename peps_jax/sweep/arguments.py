@@ -10,14 +10,14 @@ import shlex
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import peps_envs
 from peps_jax import methods
 from peps_jax.command_line import Parser, number, options, shown
 from peps_jax.config import Config
 from peps_jax.storage import files
-from peps_jax.sweep import results
+from peps_jax.sweep import meeting, results
 from peps_jax.sweep.results import Cell
 from peps_jax.train import check
 
@@ -42,7 +42,7 @@ examples:
 
 # how a sweep is run, and not what it is: these may change when it is continued
 RUNNING = (
-    "out", "overwrite", "resume", "checkpoint_every", "distributed", "coordinator", "processes", "process",
+    "out", "overwrite", "resume", "checkpoint_every", "distributed", "coordinator", "processes", "process", "wait",
 )  # fmt: skip
 
 TITLES = {
@@ -56,14 +56,22 @@ TITLES = {
 }
 
 
+class Flags(NamedTuple):
+    """A command line, read and not yet understood."""
+
+    given: dict[str, Any]  # of `settings`, those that it has
+    settings: dict[str, Any]  # the value of every flag that decides what the sweep is
+    running: dict[str, Any]  # and of those that decide how it is run
+
+
 @dataclasses.dataclass(frozen=True)
 class Request:
     """What a command line asks for, checked."""
 
     cells: list[Cell]  # the grid, in the order of the table
     trainings: dict[str, Config]  # by name; several cells may show one
-    settings: dict[str, Any]  # the value of every flag that decides what the sweep is
-    running: dict[str, Any]  # and of those that decide how it is run
+    settings: dict[str, Any]  # as in `Flags`
+    running: dict[str, Any]
     resume: bool  # continue what the folder holds
     begun_by: str = ""  # the command that began what is continued
 
@@ -120,6 +128,8 @@ def parser() -> Parser:
     group.add_argument("--coordinator", metavar="HOST:PORT", help=text)
     group.add_argument("--processes", help="how many there are", **options(2))
     group.add_argument("--process", help="which one this is, from 0", **options(0))
+    text = f"seconds to wait for the others to come and for process 0 to begin [{meeting.WAIT:g}]"
+    group.add_argument("--wait", default=meeting.WAIT, help=text, **options(meeting.WAIT))
 
     groups = {name: made.add_argument_group(title) for name, title in TITLES.items()}
     for field in dataclasses.fields(Config):
@@ -147,8 +157,8 @@ def _hashable(settings: Mapping[str, Any]) -> dict[str, Any]:
     return values | {name: tuple(dict.fromkeys(values[name])) for name in GRID if name in values}
 
 
-def read(arguments: Sequence[str]) -> Request:
-    """Reads and checks a command line.
+def flags(arguments: Sequence[str]) -> Flags:
+    """Reads a command line, and checks what decides how a sweep is run.
 
     Raises:
       ValueError: a value makes no sense; one line says which and what would be right.
@@ -157,23 +167,23 @@ def read(arguments: Sequence[str]) -> Request:
     given = _given(arguments)
     settings = _hashable(vars(parser().parse([]))) | given
     running = {name: settings.pop(name) for name in RUNNING}
-    resume, begun_by = running["resume"], ""
-    if resume:
-        if running["overwrite"]:
-            raise ValueError("resume and overwrite can't both be: --resume continues, --overwrite starts again")
-        asked = {name: value for name, value in given.items() if name not in RUNNING}
-        stored, begun_by = _stored(Path(running["out"]))
-        if stored is None and not asked:
-            raise ValueError(
-                f"out {running['out']!r} holds no sweep to continue ({results.MANIFEST} is missing): name its folder, "
-                "or say with other flags what to begin"
-            )
-        if stored is None:
-            resume = False  # the first of many times that a script is run
-        else:
-            _check_agreement(asked, stored, running["out"])
-            settings |= {name: value for name, value in stored.items() if name in settings}
     _check_running(running)
+    return Flags({name: value for name, value in given.items() if name not in RUNNING}, settings, running)
+
+
+def read(asked: Flags) -> Request:
+    """What a command line asks for. Raises ValueError for what makes no sense, or if the folder holds something else."""
+    settings, running = asked.settings, asked.running
+    out = Path(running["out"])
+    stored, begun_by = _stored(out) if running["resume"] else (None, "")
+    if stored is not None:
+        _check_agreement(asked.given, stored, running["out"])
+        settings = settings | {name: value for name, value in stored.items() if name in settings}
+    elif running["resume"] and not asked.given:  # with other flags it is the first of many times that a script is run
+        raise ValueError(
+            f"out {running['out']!r} holds no sweep to continue ({results.MANIFEST} is missing): name its folder, "
+            "or say with other flags what to begin"
+        )
     for name in ("seeds", "episodes"):
         if not 1 <= settings[name] <= MOST:
             raise ValueError(f"{name} {settings[name]} is out of range: choose 1 to {MOST}")
@@ -181,11 +191,10 @@ def read(arguments: Sequence[str]) -> Request:
     if not 0 <= settings["seed"] <= last:
         raise ValueError(f"seed {settings['seed']} is out of range: choose 0 to {last}")
     cells, trainings = grid(settings)
-    out = Path(running["out"])
-    if not (resume or running["overwrite"]):
+    if stored is None and not running["overwrite"]:
         results.check_free(out)
     files.check_writable(out)
-    return Request(cells, trainings, settings, running, resume, begun_by)
+    return Request(cells, trainings, settings, running, stored is not None, begun_by)
 
 
 def grid(settings: Mapping[str, Any]) -> tuple[list[Cell], dict[str, Config]]:
@@ -227,8 +236,12 @@ def _check_agreement(asked: Mapping[str, Any], stored: Mapping[str, Any], out: s
 
 
 def _check_running(running: Mapping[str, Any]) -> None:
+    if running["resume"] and running["overwrite"]:
+        raise ValueError("resume and overwrite can't both be: --resume continues, --overwrite starts again")
     if not running["checkpoint_every"] >= 0:
         raise ValueError(f"checkpoint_every {running['checkpoint_every']} is out of range: choose 0 or more seconds")
+    if not 0 < running["wait"] < float("inf"):
+        raise ValueError(f"wait {running['wait']:g} is out of range: choose more than 0 seconds")
     byhand = {name: running[name] for name in ("coordinator", "processes", "process")}
     missing = [name for name, value in byhand.items() if value is None]
     if 0 < len(missing) < len(byhand):

@@ -22,12 +22,14 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from peps_jax.command_line import print_whatever_can_be_shown, refuse, use_every_core
-from peps_jax.execution import checkpoints
+from peps_jax.execution import checkpoints, machine
+from peps_jax.execution.waiting import Reminder
 from peps_jax.storage import files, ownership
-from peps_jax.sweep import journal, results, workers
-from peps_jax.sweep.arguments import PROG, Request, read
+from peps_jax.sweep import journal, meeting, results, workers
+from peps_jax.sweep.arguments import PROG, Request, flags, read
 from peps_jax.sweep.results import Row
 from peps_jax.sweep.summary import print_table
 from peps_jax.sweep.underway import StoppedError, Sweep
@@ -53,12 +55,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     use_every_core()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        wanted = read(arguments)
+        asked = flags(arguments)
+        place = _place(asked.running)  # first, for a cluster may give each process devices of its own
+        machine.meet_devices()
+        wanted = read(asked)
         if wanted.resume and results.is_complete(wanted.out):
             return _nothing_to_continue(wanted)
-        by_hand = (wanted.running[name] for name in ("coordinator", "processes", "process"))
-        distributed = wanted.running["distributed"] or wanted.running["coordinator"]
-        team = workers.join(*by_hand) if distributed else workers.alone()
+        team = workers.alone() if place is None else meeting.join(place, wanted.running["wait"])
         sweep = Sweep(wanted, wanted.begun_by or _as_text(shlex.join([*PROG.split(), *arguments])), team)
         sweep.begin()
     except (ValueError, files.NotWrittenError) as error:
@@ -71,6 +74,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _run(sweep, wanted, team)
     except ownership.OwnershipLostError as error:
         return refuse(PROG, error)
+
+
+def _place(running: Mapping[str, Any]) -> meeting.Place | None:
+    """Where this process joins the others; None of a sweep in one process."""
+    if not (running["distributed"] or running["coordinator"]):
+        return None
+    place = meeting.find(*(running[name] for name in ("coordinator", "processes", "process")))
+    meeting.use_own_accelerators(place)
+    return place
 
 
 def _as_text(command: str) -> str:
@@ -86,10 +98,10 @@ def _run(sweep: Sweep, wanted: Request, team: workers.Team) -> int:
         try:
             sweep.run(stop)
             if not team.leads:
+                end = life.others.ends().get(0)
                 life.end(workers.DONE)
-                print(f"{team.name}: its share is done; process 0 makes the tables", file=sys.stderr)
-                return 0
-            wrong = sweep.gather(stop)
+                return _share_done(wanted, team, end)
+            wrong = sweep.gather(stop, life.others)
             if not sweep.complete:
                 return _incomplete(sweep, wanted, wrong)
             rows = sweep.rows()
@@ -112,6 +124,16 @@ def _run(sweep: Sweep, wanted: Request, team: workers.Team) -> int:
             print(f"failed: {_kept(sweep, wanted)}", file=sys.stderr)
             raise
     return _tell(rows, wanted, pictures)
+
+
+def _share_done(wanted: Request, team: workers.Team, end: str | None) -> int:
+    """Says that a process that doesn't lead has done its part, while process 0 has come to that end; returns the exit code."""
+    if end in (None, workers.DONE):
+        print(f"{team.name}: its share is done; process 0 makes the tables", file=sys.stderr)
+        return 0
+    left = f"process 0, which makes the tables, doesn't go on ({end}); continue with: {wanted.continued}"
+    print(f"{team.name}: its share is done and kept, but {left}", file=sys.stderr)
+    return 1
 
 
 def _tell(rows: Sequence[Row], wanted: Request, pictures: Sequence[str]) -> int:
@@ -182,7 +204,8 @@ def _draw(rows: Sequence[Row], folder: Path) -> list[str]:
     from peps_jax.sweep import pictures  # matplotlib takes its time
 
     print("drawing", file=sys.stderr)
-    return [path.name for path in pictures.draw(rows, folder)]
+    with Reminder("drawing"):
+        return [path.name for path in pictures.draw(rows, folder)]
 
 
 if __name__ == "__main__":

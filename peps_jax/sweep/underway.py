@@ -13,6 +13,7 @@ import numpy as np
 
 from peps_jax.execution import batches, checkpoints, machine, memory
 from peps_jax.execution.progress import Display, env_steps
+from peps_jax.execution.waiting import Reminder
 from peps_jax.storage import files
 from peps_jax.storage.ownership import Owner
 from peps_jax.sweep import journal, results, workers
@@ -58,7 +59,11 @@ class Sweep:
         Raises:
           ValueError: the sweep doesn't fit in memory, or the folder is another's or doesn't hold what is to be continued.
         """
-        self._plan = self._share_out() if self._team.leads else self._shared_out()
+        if self._team.leads:
+            with Reminder("planning what runs with what"):
+                self._plan = self._share_out()
+        else:
+            self._plan = self._shared_out()
         share = self._plan.shares[self._team.index]
         self.batches = {number: self._batch(self._plan.batches[number]) for number in share}
 
@@ -114,17 +119,22 @@ class Sweep:
         return batches.plan(self._configs, self._wanted.episodes, devices, free, most, self._team.count)
 
     def _shared_out(self) -> journal.Plan:
-        """Waits for process 0 to share out the batches."""
-        end = time.monotonic() + workers.PATIENCE
-        while time.monotonic() < end:
-            with contextlib.suppress(ValueError):
-                plan = self._ledger.plan()
-                if plan.run == self._team.run:
-                    return plan
-            time.sleep(0.1)
+        """Waits for process 0 to share out the batches. Raises ValueError if it doesn't."""
+        out, wait = str(self._wanted.out), self._wanted.running["wait"]
+        end = time.monotonic() + wait
+        with Reminder(f"{self._team.name} waits for process 0 to share out the batches in {out!r}"):
+            while time.monotonic() < end:
+                with contextlib.suppress(ValueError):
+                    plan = self._ledger.plan()
+                    if plan.run == self._team.run:
+                        return plan
+                if self._wanted.resume and results.is_complete(self._wanted.out):
+                    # it wasn't when this process looked first: process 0 had little left to do, and did it
+                    return journal.Plan((), ((),) * self._team.count, self._team.run)
+                time.sleep(0.1)
         raise ValueError(
-            f"out {str(self._wanted.out)!r}: process 0 hasn't shared out the batches in {workers.PATIENCE} s; "
-            "see what it says, and that every process sees this folder"
+            f"out {out!r}: process 0 hasn't shared out the batches in {wait:g} s; see what it says, and that every process sees "
+            "this folder (--wait says how long to wait)"
         )
 
     def _batch(self, planned: journal.Planned) -> batches.Batch:
@@ -193,28 +203,29 @@ class Sweep:
         with Keeper(self, stop) as keeper:
             batches.run(self._configs, list(self.batches.values()), self._wanted.episodes, keeper)
 
-    def gather(self, stop: threading.Event) -> dict[int, str]:
+    def gather(self, stop: threading.Event, others: workers.Others) -> dict[int, str]:
         """Takes in what the other processes finish, until all have ended; what went wrong, by process."""
         if self._team.count == 1 or not self._team.leads:
             return {}
-        others = workers.Others(self._wanted.out, self._team)
+        ends, end = {}, None
         left = {number for share in self._plan.shares[1:] for number in share}
-        patience = None
-        while True:
-            if stop.is_set():
-                raise StoppedError
-            self.owner.check()
-            ends = others.ends()
-            left -= {number for number in left if self._read(number, self._plan.batches[number])}
-            if not left or len(ends) == self._team.count - 1:
-                # a shared folder may show the file of a batch later than the sign that its process is done
-                patience = time.monotonic() + workers.LATE if patience is None else patience
-                late = [
-                    number for index, end in ends.items() if end == workers.DONE for number in self._plan.shares[index]
-                ]
-                if not left.intersection(late) or time.monotonic() > patience:
-                    return {index: end for index, end in ends.items() if end != workers.DONE}
-            time.sleep(0.2)
+        going_on = lambda: sorted({*range(1, self._team.count)} - ends.keys())
+        batches_left = lambda: f"{len(left)} batch{'es' * (len(left) != 1)} left"
+        with Reminder(lambda: f"process 0 waits for {workers.numbered(going_on())}, {batches_left()}"):
+            while True:
+                if stop.is_set():
+                    raise StoppedError
+                self.owner.check()
+                ends = others.ends()
+                left -= {number for number in left if self._read(number, self._plan.batches[number])}
+                if not left or not going_on():
+                    # a shared folder may show the file of a batch later than the sign that its process is done
+                    end = time.monotonic() + workers.LATE if end is None else end
+                    done = [index for index, how in ends.items() if how == workers.DONE]
+                    late = {number for index in done for number in self._plan.shares[index]}
+                    if not left & late or time.monotonic() > end:
+                        return {index: how for index, how in ends.items() if how != workers.DONE}
+                time.sleep(0.2)
 
     def checkpoints(self, number: int) -> checkpoints.Checkpoints:
         return self._ledger.checkpoints(number, [self._configs[place] for place in self.batches[number].cells])

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from peps_jax.command_line import Parser, options, print_whatever_can_be_shown, refuse, use_every_core
+from peps_jax.execution import machine
 from peps_jax.reproduce.driving import experiment, report
 from peps_jax.storage.files import NotWrittenError, check_writable
 from peps_jax.storage.ownership import Owner
@@ -73,6 +74,7 @@ def request(arguments: Sequence[str]) -> Request:
       SystemExit: a flag that doesn't exist or can't be read (code 2), or --help (code 0).
     """
     values = parser().parse(arguments)
+    machine.meet_devices()
     if not 1 <= values.seeds <= MOST:
         raise ValueError(f"seeds {values.seeds} is out of range: choose 1 to {MOST}")
     last = 2**31 - values.seeds
