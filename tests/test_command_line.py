@@ -1,21 +1,25 @@
 """What the command lines share: text for whatever terminal there is, devices, waiting, complaints of one line, exit codes."""
 
 import ast
+import contextlib
 import io
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
 import time
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from peps_jax import command_line
-from peps_jax.execution import batches, machine, waiting
+from peps_jax.execution import batches, checkpoints, machine, waiting
 from peps_jax.execution.progress import Display
+from peps_jax.storage import files
 
 ROOT = Path(__file__).parents[1]
 TINY = [
@@ -233,3 +237,123 @@ def test_long_compilation_rounds_and_evaluation_say_so(tiny, monkeypatch, capsys
 def _command(folder: Path) -> str:
     """The command that a folder's manifest tells."""
     return json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["command"]
+
+
+# --- from call to exit code -----------------------------------------------------------------------------------------------
+
+
+class Errand:
+    """Work that a test gives."""
+
+    name, makes_checkpoints = "process 3", False
+
+    def __init__(self, act, makes_checkpoints: bool = False):
+        self._act, self.makes_checkpoints = act, makes_checkpoints
+        self.told: list[str] = []
+
+    def run(self, stop: threading.Event) -> int:
+        return self._act(stop)
+
+    def kept(self) -> str:
+        self.told.append("kept")
+        return "2 of 3 are kept"
+
+    def writing(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext()
+
+    def close(self) -> None:
+        self.told.append("closed")
+
+
+def carry_out(errand: Errand) -> int:
+    return command_line.Command("a command", list, lambda flags: errand).carry_out([])
+
+
+def raising(error: BaseException):
+    """Work that ends with that."""
+
+    def act(stop: threading.Event) -> int:
+        raise error
+
+    return act
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (KeyboardInterrupt(), 130, "\nprocess 3 stopped: 2 of 3 are kept\n"),
+        (command_line.StoppedError(), 143, "\nprocess 3 stopped: 2 of 3 are kept\n"),
+        (files.NotWrittenError("no room"), 2, "a command: error: no room; 2 of 3 are kept\n"),
+        (checkpoints.IncompatibleError("another\nversion"), 2, "a command: error: another version; 2 of 3 are kept\n"),
+        (files.OwnershipLostError("lost"), 2, "a command: error: lost\n"),
+    ],
+)
+def test_what_ends_work_is_one_line_and_a_code(error, code, said, capsys):
+    errand = Errand(raising(error))
+    assert carry_out(errand) == code
+    assert capsys.readouterr().err == said
+    assert errand.told[-1] == "closed"
+
+
+def test_a_fault_in_the_code_keeps_its_stack(capsys):
+    errand = Errand(raising(ValueError("a fault")))
+    with pytest.raises(ValueError, match="a fault"):
+        carry_out(errand)
+    assert capsys.readouterr().err == "failed: 2 of 3 are kept\n"
+    assert errand.told == ["kept", "closed"]
+
+
+def test_sigterm_interrupts_work_that_makes_no_checkpoint(capsys):
+    def act(stop: threading.Event) -> int:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(10)
+        raise AssertionError("went on")
+
+    before = signal.getsignal(signal.SIGTERM)
+    assert carry_out(Errand(act)) == 143
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_sigterm_waits_for_a_checkpoint():
+    def act(stop: threading.Event) -> int:
+        assert not stop.is_set()
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.wait(10)
+        return 7
+
+    assert carry_out(Errand(act, makes_checkpoints=True)) == 7
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (ValueError("seeds 0 is\n too few"), 2, "a command: error: seeds 0 is too few\n"),
+        (files.NotWrittenError("no permission"), 2, "a command: error: no permission\n"),
+        (KeyboardInterrupt(), 130, "\nstopped before anything was begun\n"),
+        (command_line.StoppedError(), 143, "\nstopped before anything was begun\n"),
+    ],
+)
+def test_what_ends_the_preparation_is_one_line_and_a_code(error, code, said, capsys):
+    assert command_line.Command("a command", list, raising(error)).carry_out([]) == code
+    assert capsys.readouterr().err == said
+
+
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["scripts"]
+
+
+@pytest.mark.parametrize(
+    ("script", "module"), [("peps-sweep", "peps_jax.sweep"), ("peps-reproduce", "peps_jax.reproduce")]
+)
+def test_help_names_the_command_that_was_called(script, module):
+    place, _, function = SCRIPTS[script].partition(":")
+    program = (
+        f"import sys; sys.argv = ['/somewhere/bin/{script}', '--help']; from {place} import {function} as main; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, env=os.environ, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr
+    text = done.stdout.decode("utf-8")
+    assert text.startswith(f"usage: {script} [")
+    assert f"python -m {module}" not in text
+    called = run(module, "--help").stdout.decode("utf-8")
+    assert called.startswith(f"usage: python -m {module} [")
+    assert called.replace(f"python -m {module}", script) == text

@@ -22,7 +22,7 @@ LAYERS = (
     ("peps_envs.registry",),
     ("peps_envs",),
     ("peps_envs.bridges",),
-    ("peps_jax.storage", "peps_jax.command_line", "peps_jax.trajectory"),
+    ("peps_jax.storage", "peps_jax.trajectory"),
     ("peps_jax.config",),
     ("peps_jax.learning.networks", "peps_jax.learning.replay", "peps_jax.learning.policy_heads"),
     ("peps_jax.learning", "peps_jax.preferences"),
@@ -35,6 +35,7 @@ LAYERS = (
     ("peps_jax.analysis", "peps_jax.drawing"),
     *(tuple(f"peps_jax.execution.{name}" for name in ("memory", "compilation_cache", "machine", "waiting")),),
     ("peps_jax.execution",),
+    ("peps_jax.command_line",),
     ("peps_jax.sweep",),
     ("peps_jax.reproduce",),
 )

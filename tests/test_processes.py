@@ -16,6 +16,7 @@ from commands import contents, exit_code
 
 import peps_envs
 from peps_jax.execution import batches, waiting
+from peps_jax.storage import files
 from peps_jax.sweep import command, meeting, pictures, results, workers
 
 SIZES = [
@@ -199,21 +200,21 @@ def test_life_and_death_are_told_apart(tmp_path, monkeypatch):
     (tmp_path / "progress").mkdir()
     teams = [workers.Team(index, 4, "now") for index in range(4)]
     earlier = workers.Life(tmp_path, teams[1]._replace(run="earlier"))
-    earlier.begin()
-    earlier.end(workers.DONE)
+    with earlier:
+        pass
     done, alive = workers.Life(tmp_path, teams[2]), workers.Life(tmp_path, teams[3])
-    done.begin()
-    alive.begin()
+    done.__enter__()
+    alive.__enter__()
     others = workers.Others(tmp_path, teams[0])
     assert others.ends() == {}
-    done.end(workers.DONE)
+    done.__exit__(None, None, None)
     end = time.monotonic() + 0.6
     while time.monotonic() < end:
         ends = others.ends()
         time.sleep(0.02)
     assert ends == {1: "no sign of life for 0 s", 2: workers.DONE}
-    alive.end(workers.FAILED, "because")
-    assert others.ends()[3] == "failed: because"
+    alive.__exit__(ValueError, ValueError("because"), None)
+    assert others.ends()[3] == "failed: ValueError: because"
 
 
 def test_who_does_not_go_on_is_said_meanwhile(tmp_path, monkeypatch, capsys):
@@ -223,13 +224,13 @@ def test_who_does_not_go_on_is_said_meanwhile(tmp_path, monkeypatch, capsys):
     teams = [workers.Team(index, 4, "now") for index in range(4)]
     first, second, third = (workers.Life(tmp_path, team) for team in teams[:3])
     for life in (first, second, third):
-        life.begin()
+        life.__enter__()
     time.sleep(0.8)  # process 3 doesn't come
-    third.end(workers.DONE)
-    first.end(workers.FAILED, "because")
+    third.__exit__(None, None, None)
+    first.__exit__(files.NotWrittenError, files.NotWrittenError("no room"), None)
     time.sleep(0.3)
-    second.end(workers.DONE)
+    second.__exit__(None, None, None)
     assert capsys.readouterr().err.splitlines() == [
         "process 0: process 3 doesn't go on (no sign of life for 0 s); the others go on, and --resume does what is left",
-        "process 1: process 0 doesn't go on (failed: because); this one goes on",
+        "process 1: process 0 doesn't go on (failed: no room); this one goes on",
     ]

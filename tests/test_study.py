@@ -243,7 +243,7 @@ def test_another_study_is_never_replaced_unasked(tmp_path, capsys, monkeypatch):
     assert command.main(["--out", str(tmp_path)]) == 2
     assert "holds another study" in capsys.readouterr().err
     assert (tmp_path / report.TABLE).read_text(encoding="utf-8") == "precious"
-    assert command.request(["--out", str(tmp_path), "--overwrite"]).out == tmp_path
+    assert command.request(command.parser().parse(["--out", str(tmp_path), "--overwrite"])).out == tmp_path
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from commands import exit_code, is_one_complaint
 
 import peps_envs
 import peps_jax
+from peps_jax import command_line
 from peps_jax.execution import batches, memory
 from peps_jax.sweep import command, pictures, results
 from peps_jax.train import finish, init
@@ -115,11 +116,11 @@ def test_every_field_is_a_flag(capsys):
 
 def test_one_device_per_core_unless_told_otherwise(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--some_flag=1")
-    command.use_every_core()
+    command_line.use_every_core()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     assert os.environ["XLA_FLAGS"] == f"--some_flag=1 --xla_force_host_platform_device_count={cores}"
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=7")
-    command.use_every_core()
+    command_line.use_every_core()
     assert os.environ["XLA_FLAGS"] == "--xla_force_host_platform_device_count=7"
 
 

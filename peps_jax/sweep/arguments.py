@@ -6,39 +6,39 @@ import argparse
 import dataclasses
 import itertools
 import json
+import os
 import shlex
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import peps_envs
 from peps_jax import methods
-from peps_jax.command_line import Parser, number, options, shown
+from peps_jax.command_line import Parser, called, number, options, shown
 from peps_jax.config import Config
 from peps_jax.storage import files
 from peps_jax.sweep import meeting, results
 from peps_jax.sweep.results import Cell
 from peps_jax.train import check
 
-PROG = "python -m peps_jax.sweep"
+PROG = called("peps_jax.sweep", "peps-sweep")
 MOST = 100_000  # seeds, and evaluation episodes
 GRID = ("env", "method", "lam")  # fields of which a sweep takes several values
 DEMONSTRATION = {"env": ("nav-d1", "nav-d4"), "method": ("peps", "sac"), "lam": (2.4,)}
 
 DESCRIPTION = """\
-Trains every cell of a grid of worlds, methods, lambdas and seeds, side by side on all
+Trains every cell of a grid of environments, methods, lambdas and seeds, side by side on all
 devices, and writes tables, curves, learned parameters and pictures into a folder.
 Without flags: a demonstration of a few minutes."""
 
-EPILOG = """\
-A method that doesn't use lambda (any but peps) is trained once for each world and seed; its row is
+EPILOG = f"""\
+A method that doesn't use lambda (any but peps) is trained once for each environment and seed; its row is
 repeated for every lambda, so that the table holds the whole grid.
 
 examples:
-  python -m peps_jax.sweep
-  python -m peps_jax.sweep --env nav-d1 nav-d4 --lam 2.0 2.4 2.8 --seeds 8 --out results/mine
-  python -m peps_jax.sweep --env nav-d2 --belief unbiased --hidden-sizes 128 128 --out results/wide"""
+  {PROG}
+  {PROG} --env nav-d1 nav-d4 --lam 2.0 2.4 2.8 --seeds 8 --out results/mine
+  {PROG} --env nav-d2 --belief unbiased --hidden-sizes 128 128 --out results/wide"""
 
 # how a sweep is run, and not what it is: these may change when it is continued
 RUNNING = (
@@ -59,6 +59,7 @@ TITLES = {
 class Flags(NamedTuple):
     """A command line, read and not yet understood."""
 
+    arguments: tuple[str, ...]  # as they were typed
     given: dict[str, Any]  # of `settings`, those that it has
     settings: dict[str, Any]  # the value of every flag that decides what the sweep is
     running: dict[str, Any]  # and of those that decide how it is run
@@ -73,7 +74,7 @@ class Request:
     settings: dict[str, Any]  # as in `Flags`
     running: dict[str, Any]
     resume: bool  # continue what the folder holds
-    begun_by: str = ""  # the command that began what is continued
+    begun_by: str  # the command that began it, this one or an earlier one
 
     @property
     def out(self) -> Path:
@@ -92,14 +93,10 @@ class Request:
 
 def parser() -> Parser:
     """The command line's parser, made of `Config`'s fields."""
-    width = min(120, shutil.get_terminal_size((110, 24)).columns)
-    made = Parser(
-        prog=PROG, usage=f"{PROG} [flags]", description=DESCRIPTION, epilog=EPILOG, add_help=False, allow_abbrev=False,
-        formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, max_help_position=34, width=width),
-    )  # fmt: skip
+    made = Parser(PROG, description=DESCRIPTION, epilog=EPILOG, add_help=False)
     group = made.add_argument_group("grid")
     texts = {
-        "env": f"worlds: {', '.join(peps_envs.names())}",
+        "env": f"environments: {', '.join(peps_envs.names())}",
         "method": f"methods: {', '.join(methods.METHODS)}",
         "lam": "reconciliation parameters: weight of explicability against return",
     }
@@ -157,7 +154,7 @@ def _hashable(settings: Mapping[str, Any]) -> dict[str, Any]:
     return values | {name: tuple(dict.fromkeys(values[name])) for name in GRID if name in values}
 
 
-def flags(arguments: Sequence[str]) -> Flags:
+def read(arguments: Sequence[str]) -> Flags:
     """Reads a command line, and checks what decides how a sweep is run.
 
     Raises:
@@ -168,10 +165,11 @@ def flags(arguments: Sequence[str]) -> Flags:
     settings = _hashable(vars(parser().parse([]))) | given
     running = {name: settings.pop(name) for name in RUNNING}
     _check_running(running)
-    return Flags({name: value for name, value in given.items() if name not in RUNNING}, settings, running)
+    given = {name: value for name, value in given.items() if name not in RUNNING}
+    return Flags(tuple(arguments), given, settings, running)
 
 
-def read(asked: Flags) -> Request:
+def understood(asked: Flags) -> Request:
     """What a command line asks for. Raises ValueError for what makes no sense, or if the folder holds something else."""
     settings, running = asked.settings, asked.running
     out = Path(running["out"])
@@ -194,7 +192,13 @@ def read(asked: Flags) -> Request:
     if stored is None and not running["overwrite"]:
         results.check_free(out)
     files.check_writable(out)
+    begun_by = begun_by or _as_text(shlex.join([*PROG.split(), *asked.arguments]))
     return Request(cells, trainings, settings, running, stored is not None, begun_by)
+
+
+def _as_text(command: str) -> str:
+    """A command as UTF-8 has it: a locale that knows ASCII alone took its words for bytes."""
+    return os.fsencode(command).decode("utf-8", "surrogateescape")
 
 
 def grid(settings: Mapping[str, Any]) -> tuple[list[Cell], dict[str, Config]]:

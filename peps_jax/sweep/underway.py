@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 import jax
 import numpy as np
 
+from peps_jax.command_line import StoppedError
 from peps_jax.execution import batches, checkpoints, machine, memory
 from peps_jax.execution.progress import Display, env_steps
 from peps_jax.execution.waiting import Reminder
@@ -21,16 +22,11 @@ from peps_jax.sweep.arguments import Request
 from peps_jax.sweep.results import Row
 
 
-class StoppedError(Exception):
-    """The process was asked to end, and has made a checkpoint."""
-
-
 class Sweep:
     """A request on its way: what is finished, and its folder, which is this sweep's from `begin` to `close`.
 
     Args:
       wanted: what is to be trained.
-      command: that began it.
       team: the processes that share it.
 
     Raises:
@@ -38,13 +34,13 @@ class Sweep:
       OwnershipLostError: from whatever writes, if the folder is another's now.
     """
 
-    def __init__(self, wanted: Request, command: str, team: workers.Team):
+    def __init__(self, wanted: Request, team: workers.Team):
         self.owner = Owner(wanted.out, team.run)
         self.batches: dict[int, batches.Batch] = {}  # this process's, by number
         self._wanted, self._team = wanted, team
         self._configs = list(wanted.trainings.values())
         self._places = {name: place for place, name in enumerate(wanted.trainings)}
-        self._writer = results.Writer(wanted.out, command, wanted.settings)
+        self._writer = results.Writer(wanted.out, wanted.begun_by, wanted.settings)
         self._ledger = journal.Ledger(wanted.out, _about(wanted))
         self._finished: dict[str, batches.Finished] = {}
         self._times, self._env_steps = batches.Times(), 0

@@ -17,6 +17,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from peps_jax.command_line import StoppedError
+from peps_jax.execution.checkpoints import IncompatibleError
 from peps_jax.execution.waiting import print_line
 from peps_jax.storage import files
 from peps_jax.sweep.journal import FOLDER
@@ -75,7 +77,7 @@ class Life:
         self._thread: threading.Thread | None = None
         self._told = {"status": RUNNING, "reason": ""}
 
-    def begin(self) -> None:
+    def __enter__(self) -> Life:
         """From now on there is a sign of life every `BEAT` seconds."""
         if self._team.count > 1:
             self._tell()
@@ -83,9 +85,19 @@ class Life:
             beat = contextvars.copy_context().run
             self._thread = threading.Thread(target=beat, args=(self._beat,), daemon=True)
             self._thread.start()
+        return self
 
-    def end(self, status: str, reason: str = "") -> None:
-        """How it ended: DONE, STOPPED or FAILED."""
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        """Tells how it ended."""
+        if error is None:
+            self._end(DONE, "")
+        elif isinstance(error, KeyboardInterrupt | StoppedError):
+            self._end(STOPPED, "asked to")
+        else:
+            plain = isinstance(error, files.NotWrittenError | IncompatibleError)  # which speak for themselves
+            self._end(FAILED, f"{'' if plain else f'{kind.__name__}: '}{error}".splitlines()[0])
+
+    def _end(self, status: str, reason: str) -> None:
         if self._thread is not None and not self._over.is_set():
             self._over.set()
             self._thread.join()
