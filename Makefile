@@ -6,7 +6,7 @@ READY := .venv/ready
 ARGS ?=
 REPRODUCED ?= results/reproduce
 
-.PHONY: sweep reproduce test verify-navigation benchmark readme publish lint lock setup
+.PHONY: sweep reproduce test docs film verify-navigation benchmark readme publish lint lock setup
 .DEFAULT_GOAL := sweep
 
 sweep: $(READY)
@@ -18,6 +18,13 @@ reproduce: $(READY)
 
 test: $(READY)
 	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal --durations 10 $(ARGS)
+
+# the pages under docs/ and the API's reference as a site in site/; a warning is an error
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir site $(ARGS)
+
+film: $(READY)
+	$(BIN)/python benchmarks/film.py $(ARGS)
 
 verify-navigation: $(READY)
 	$(BIN)/python benchmarks/verify_navigation.py $(ARGS)
@@ -54,4 +61,4 @@ $(READY): requirements.lock pyproject.toml
 lock: $(READY)
 	$(BIN)/pip install --quiet uv
 	echo hatchling | $(BIN)/uv pip compile --upgrade --universal --no-header --no-annotate --no-emit-index-url \
-		--no-emit-find-links --extra test pyproject.toml - --output-file requirements.lock
+		--no-emit-find-links --extra test --extra docs pyproject.toml - --output-file requirements.lock

@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=10_000, help="trainings of the larger one [10000]")
     parser.add_argument("--devices", type=int, nargs="+", default=[16, 64, 256, 1024], help="that share them")
     arguments = parser.parse_args()
-    one = measured(json.loads((arguments.folder / "manifest.json").read_text()))
+    one = measured(json.loads((arguments.folder / "manifest.json").read_text(encoding="utf-8")))
     lines = [
         f"{arguments.cells:,} trainings of {one.env_steps:,.0f} environment steps; measured: "
         f"{one.seconds:.1f} s for one on one device ({one.device}), {one.compile_seconds:.0f} s of compilation.",
@@ -59,8 +59,8 @@ def main() -> None:
     for devices in arguments.devices:
         time = hours(one, arguments.cells, devices)
         lines.append(f"| {devices:,} | {time:,.2f} | {time * devices:,.0f} |")
-    FILE.write_text("\n".join(lines) + "\n")
-    print(FILE.read_text())
+    FILE.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print(FILE.read_text(encoding="utf-8"))
 
 
 if __name__ == "__main__":

@@ -92,7 +92,7 @@ def _sweep(surroundings: dict[str, str], out: pathlib.Path) -> float:
     }
     command = [sys.executable, "-m", "peps_jax.sweep", *(f"--{name}={value}" for name, value in flags.items())]
     subprocess.run(command, check=True, capture_output=True, env=dict(os.environ) | surroundings)
-    return json.loads((out / "manifest.json").read_text())["compile_seconds"]
+    return json.loads((out / "manifest.json").read_text(encoding="utf-8"))["compile_seconds"]
 
 
 def measure(quick: bool) -> dict[str, Any]:

@@ -18,6 +18,7 @@ FOLDER = pathlib.Path(__file__).parent
 SCRIPTS, HOMES = FOLDER / "peers", FOLDER / ".peers"
 CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
 PATIENCE = 1_800.0  # s that a script may take
+TEXT = {"encoding": "utf-8", "errors": "replace"}  # how a script's output is read, whatever the locale
 
 
 class Missing(Exception):
@@ -44,9 +45,9 @@ def python_of(name: str) -> pathlib.Path:
     Raises:
       Missing: it could not be installed.
     """
-    home, wanted = HOMES / name, (SCRIPTS / f"{name}.txt").read_text()
+    home, wanted = HOMES / name, (SCRIPTS / f"{name}.txt").read_text(encoding="utf-8")
     python, mark = home / "bin/python", home / "installed.txt"
-    if mark.exists() and mark.read_text() == wanted:
+    if mark.exists() and mark.read_text(encoding="utf-8") == wanted:
         return python
     print(f"installing {name}", flush=True)
     try:
@@ -54,7 +55,7 @@ def python_of(name: str) -> pathlib.Path:
         _call([python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "-r", SCRIPTS / f"{name}.txt"])
     except OSError as error:
         raise Missing(str(error)) from None
-    mark.write_text(wanted)
+    mark.write_text(wanted, encoding="utf-8")
     return python
 
 
@@ -120,12 +121,12 @@ def _surroundings(name: str) -> dict[str, str]:
 
 
 def _start(command: Sequence[object], surroundings: dict[str, str], cores: Sequence[int]) -> Running:
-    pipe, errors = subprocess.PIPE, tempfile.TemporaryFile("w+")  # noqa: SIM115, it outlives this function
+    pipe, errors = subprocess.PIPE, tempfile.TemporaryFile("w+", **TEXT)  # noqa: SIM115, it outlives this function
     pin = getattr(os, "sched_setaffinity", lambda process, cores: None)
     pin(0, cores)  # this thread's, which the process inherits
     try:
         process = subprocess.Popen(
-            list(map(str, command)), stdin=pipe, stdout=pipe, stderr=errors, text=True, env=surroundings
+            list(map(str, command)), stdin=pipe, stdout=pipe, stderr=errors, env=surroundings, **TEXT
         )
     finally:
         pin(0, CORES)
@@ -143,7 +144,7 @@ def _next_line(started: Running, start: str) -> str:
 
 def _call(command: Sequence[object], surroundings: dict[str, str] | None = None) -> str:
     command = list(map(str, command))
-    done = subprocess.run(command, capture_output=True, text=True, env=surroundings, timeout=PATIENCE, check=False)
+    done = subprocess.run(command, capture_output=True, env=surroundings, timeout=PATIENCE, check=False, **TEXT)
     if done.returncode:
         raise Missing(_last_line(done.stderr))
     return done.stdout

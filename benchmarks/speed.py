@@ -20,7 +20,7 @@ from typing import Any
 
 import jax
 
-from peps_jax.command_line import use_every_core
+from peps_jax.command_line import print_whatever_can_be_shown, use_every_core
 
 FOLDER = pathlib.Path(__file__).parent
 SECTIONS = ("worlds", "training", "roof", "rounds", "layers", "growth")
@@ -29,7 +29,7 @@ SECTIONS = ("worlds", "training", "roof", "rounds", "layers", "growth")
 def processor() -> str:
     """The processor's name."""
     try:
-        lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
+        lines = pathlib.Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()
@@ -52,6 +52,7 @@ def main() -> None:
         "--out", type=pathlib.Path, help="folder to write [benchmarks/results; --quick: build/benchmark]"
     )
     arguments = parser.parse_args()
+    print_whatever_can_be_shown()
     use_every_core()
     if arguments.quick:  # nearly all of its time is compilation
         os.environ["XLA_FLAGS"] += " --xla_backend_optimization_level=0"
@@ -61,7 +62,7 @@ def main() -> None:
                "jax": jax.__version__}  # fmt: skip
     record = {"quick": arguments.quick, "machine": machine}
     out.mkdir(parents=True, exist_ok=True)
-    save = lambda: (out / "speed.json").write_text(json.dumps(record, indent=1) + "\n")
+    save = lambda: (out / "speed.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     for section in SECTIONS:
         record[section] = measure(section, arguments.quick)
         save()
@@ -71,7 +72,7 @@ def main() -> None:
 
     record["ratios"] = report.ratios(record)
     save()
-    (out / "speed.md").write_text(report.text(record))
+    (out / "speed.md").write_text(report.text(record), encoding="utf-8")
     report.draw(record, out / "speed.png")
     print(report.text(record))
 

@@ -25,7 +25,7 @@ from peps_envs.navigation import NavigationState
 from peps_jax import Config, evaluate
 from peps_jax.analysis import navigation_planner
 from peps_jax.analysis.intervals import estimate, mean
-from peps_jax.command_line import use_every_core
+from peps_jax.command_line import print_whatever_can_be_shown, use_every_core
 from peps_jax.execution.devices import compile_over_devices
 from peps_jax.learning import surrogate
 from peps_jax.preferences import synthetic_human
@@ -193,14 +193,15 @@ def main() -> None:
     parser.add_argument("--lam-seeds", type=int, default=4, help="trainings per domain and lambda")
     parser.add_argument("--steps", type=int, default=Config().total_steps, help="environment steps of a training")
     arguments = parser.parse_args()
+    print_whatever_can_be_shown()
     use_every_core()
     base = Config(total_steps=arguments.steps)
     record = {"seeds": arguments.seeds, "steps": arguments.steps}
     record["domains"] = measured_domains(base, range(arguments.seeds))
     record["lambda"] = measured_lambdas(base, range(arguments.lam_seeds))
     FOLDER.mkdir(exist_ok=True)
-    (FOLDER / "navigation.json").write_text(json.dumps(record, indent=1) + "\n")
-    (FOLDER / "navigation.md").write_text(tables(record))
+    (FOLDER / "navigation.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    (FOLDER / "navigation.md").write_text(tables(record), encoding="utf-8")
     print(tables(record))
 
 

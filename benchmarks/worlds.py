@@ -91,7 +91,7 @@ def difference() -> float:
 
 
 def _with_file(content: Any, use: Any) -> Any:
-    with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
+    with tempfile.NamedTemporaryFile("w", suffix=".json", encoding="utf-8") as file:
         json.dump(content, file)
         file.flush()
         return use(file.name)

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import numbers
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,43 +18,26 @@ from flax import struct
 
 import peps_envs
 from peps_envs.registry import unknown_name
+from peps_jax.fields import (
+    COUNT,
+    COUNT_OR_NONE,
+    FLOOR,
+    NOT_NEGATIVE,
+    POSITIVE,
+    SHARE,
+    SIZES,
+    SWITCH,
+    Right,
+    check_single,
+    check_value,
+    shown,
+    static,
+    traced,
+)  # fmt: skip
 
 STRATEGIES = ("information_gain", "disagreement", "random")
 LEVELS = ("none", "quantile", "max", "standard")
 ENTROPIES = ("relative", "absolute")
-MOST = 2**31 - 1  # of whole numbers: sizes and seeds are 32-bit
-
-
-class Right(NamedTuple):
-    """What values of a setting make sense, as a test of one value and as words."""
-
-    holds: Callable[[Any], Any]
-    words: str
-
-
-NOT_NEGATIVE = Right(lambda value: (value >= 0) & np.isfinite(value), "0 or more")
-POSITIVE = Right(lambda value: (value > 0) & np.isfinite(value), "above 0")
-SHARE = Right(lambda value: (value >= 0) & (value <= 1), "from 0 to 1")
-COUNT = Right(lambda value: (value >= 1) & (value <= MOST), f"a whole number from 1 to {MOST}")
-COUNT_OR_NONE = Right(lambda value: (value >= 0) & (value <= MOST), f"a whole number from 0 to {MOST}")
-SIZES = Right(lambda value: COUNT.holds(value), f"one or more sizes, whole numbers from 1 to {MOST}")
-FLOOR = Right(lambda value: value < np.inf, "a number, or -inf for none")
-SWITCH = Right(lambda value: value is True or value is False, "True or False")
-
-
-def _one_of(choices: tuple[str, ...]) -> Right:
-    return Right(lambda value: value in choices, ", ".join(choices))
-
-
-def _static(default: Any, right: Right | tuple[str, ...] | None, text: str, **metadata: Any) -> Any:
-    choices = right if isinstance(right, tuple) and not isinstance(right, Right) else None
-    right = right if choices is None else _one_of(choices)
-    metadata |= {"help": text, "right": right, "choices": choices}
-    return struct.field(pytree_node=False, default=default, metadata=metadata)
-
-
-def _traced(default: Any, right: Right | None, text: str, **metadata: Any) -> Any:
-    return struct.field(default=default, metadata={"help": text, "right": right, "choices": None, **metadata})
 
 
 @struct.dataclass
@@ -76,107 +57,103 @@ class Config:
     task knows ("biased", "unbiased", ...) or a pytree of parameters. `check()` raises ValueError for values that make no sense.
     """
 
-    env: Any = _static("nav-d1", None, "the environment", group="task")
-    method: str = _static(
+    env: Any = static("nav-d1", None, "the environment", group="task")
+    method: str = static(
         "peps",
         None,
         "what is learned, and from which reward: peps, sac, drlhp, policy_shaping or human_expectation",
         group="task",
     )
-    seed: Any = _traced(0, COUNT_OR_NONE, "random seed", group="task")
-    params: Any = _traced(
+    seed: Any = traced(0, COUNT_OR_NONE, "random seed", group="task")
+    params: Any = traced(
         None, None, "true parameters of the environment (default: the task's)", group="task", flag=False
     )
-    belief: Any = _traced(None, None, "what the human believes (default: the task's first belief)", group="task")
+    belief: Any = traced(None, None, "what the human believes (default: the task's first belief)", group="task")
 
     # Eq. (6)
-    lam: Any = _traced(
+    lam: Any = traced(
         2.4, NOT_NEGATIVE, "reconciliation parameter: weight of explicability against return", group="objective"
     )
-    surrogate_weight: Any = _traced(1.0, NOT_NEGATIVE, "weight of the surrogate reward in Eq. (6)", group="objective")
-    environment_entropy_weight: Any = _traced(
+    surrogate_weight: Any = traced(1.0, NOT_NEGATIVE, "weight of the surrogate reward in Eq. (6)", group="objective")
+    environment_entropy_weight: Any = traced(
         1.0, NOT_NEGATIVE, "weight of the environment entropy in Eq. (6)", group="objective"
     )
-    policy_entropy_weight: Any = _traced(
-        0.3, NOT_NEGATIVE, "weight of the policy entropy in Eq. (6)", group="objective"
-    )
-    entropies: str = _static(
+    policy_entropy_weight: Any = traced(0.3, NOT_NEGATIVE, "weight of the policy entropy in Eq. (6)", group="objective")
+    entropies: str = static(
         "relative",
         ENTROPIES,
         "what Eq. (6)'s entropies are measured against: kernel and uniform policy (relative), or nothing (absolute)",
         group="objective",
     )
-    gamma: Any = _traced(0.995, SHARE, "discount", group="objective")
+    gamma: Any = traced(0.995, SHARE, "discount", group="objective")
 
-    total_steps: int = _static(40_000, COUNT, "environment steps in all", group="run")
-    num_envs: int = _static(16, COUNT, "environments side by side", group="run")
-    rollout_length: int = _static(25, COUNT, "steps that each environment makes in a round", group="run")
-    warmup_steps: int = _static(
+    total_steps: int = static(40_000, COUNT, "environment steps in all", group="run")
+    num_envs: int = static(16, COUNT, "environments side by side", group="run")
+    rollout_length: int = static(25, COUNT, "steps that each environment makes in a round", group="run")
+    warmup_steps: int = static(
         3_200, COUNT_OR_NONE, "environment steps with uniformly random actions at the start", group="run"
     )
-    exploration: Any = _traced(0.2, SHARE, "share of the steps after that with such actions", group="run")
-    hold_steps: int = _static(5, COUNT, "steps for which such an action is held", group="run")
+    exploration: Any = traced(0.2, SHARE, "share of the steps after that with such actions", group="run")
+    hold_steps: int = static(5, COUNT, "steps for which such an action is held", group="run")
 
-    learning_rate: Any = _traced(1e-3, POSITIVE, "Adam's rate for policy and critics", group="sac")
-    fade_share: Any = _traced(
+    learning_rate: Any = traced(1e-3, POSITIVE, "Adam's rate for policy and critics", group="sac")
+    fade_share: Any = traced(
         0.3, SHARE, "share of the rounds, at the end, over which that rate falls to a tenth", group="sac"
     )
-    temperature: Any = _traced(
+    temperature: Any = traced(
         0.02, NOT_NEGATIVE, "weight of the policy entropy beside Eq. (6)'s, at the end (in reward units)", group="sac"
     )
-    initial_temperature: Any = _traced(3.0, NOT_NEGATIVE, "the same at the start: exploration fades", group="sac")
-    anneal_share: Any = _traced(0.8, SHARE, "share of the rounds over which the temperature fades", group="sac")
-    saturation_penalty: Any = _traced(
+    initial_temperature: Any = traced(3.0, NOT_NEGATIVE, "the same at the start: exploration fades", group="sac")
+    anneal_share: Any = traced(0.8, SHARE, "share of the rounds over which the temperature fades", group="sac")
+    saturation_penalty: Any = traced(
         0.02, NOT_NEGATIVE, "price of a squared action before tanh (in reward units)", group="sac"
     )
-    tune_temperature: bool = _static(False, SWITCH, "tune the temperature to a target entropy instead", group="sac")
-    target_rate: Any = _traced(0.01, SHARE, "share of the critics that the targets take over at an update", group="sac")
-    reward_scale: Any = _traced(
-        0.1, POSITIVE, "what rewards are multiplied by before the critics see them", group="sac"
-    )
-    updates_per_step: float = _static(0.25, POSITIVE, "SAC updates per environment step", group="sac")
-    batch_size: int = _static(256, COUNT, "transitions in a minibatch", group="sac")
-    hidden_sizes: tuple[int, ...] = _static((64, 64), SIZES, "hidden layers of policy and critics", group="sac")
+    tune_temperature: bool = static(False, SWITCH, "tune the temperature to a target entropy instead", group="sac")
+    target_rate: Any = traced(0.01, SHARE, "share of the critics that the targets take over at an update", group="sac")
+    reward_scale: Any = traced(0.1, POSITIVE, "what rewards are multiplied by before the critics see them", group="sac")
+    updates_per_step: float = static(0.25, POSITIVE, "SAC updates per environment step", group="sac")
+    batch_size: int = static(256, COUNT, "transitions in a minibatch", group="sac")
+    hidden_sizes: tuple[int, ...] = static((64, 64), SIZES, "hidden layers of policy and critics", group="sac")
 
-    ensemble_size: int = _static(5, COUNT, "members of the dynamics and of the surrogate ensemble", group="models")
-    model_hidden_sizes: tuple[int, ...] = _static(
+    ensemble_size: int = static(5, COUNT, "members of the dynamics and of the surrogate ensemble", group="models")
+    model_hidden_sizes: tuple[int, ...] = static(
         (32, 32), SIZES, "hidden layers of dynamics and surrogate networks", group="models"
     )
-    dynamics_learning_rate: Any = _traced(1e-3, POSITIVE, "Adam's rate for the dynamics", group="models")
-    dynamics_updates: int = _static(20, COUNT, "gradient steps on the dynamics in a round", group="models")
-    dynamics_batch_size: int = _static(256, COUNT, "transitions in a minibatch of the dynamics' fit", group="models")
-    surrogate_learning_rate: Any = _traced(5e-3, POSITIVE, "Adam's rate for the surrogate reward", group="models")
-    surrogate_updates: int = _static(40, COUNT, "gradient steps on the surrogate reward in a round", group="models")
-    surrogate_batch_size: int = _static(64, COUNT, "preferences in a minibatch of the surrogate's fit", group="models")
-    surrogate_decay: Any = _traced(1e-4, NOT_NEGATIVE, "weight decay of the surrogate's fit", group="models")
-    level: str = _static(
+    dynamics_learning_rate: Any = traced(1e-3, POSITIVE, "Adam's rate for the dynamics", group="models")
+    dynamics_updates: int = static(20, COUNT, "gradient steps on the dynamics in a round", group="models")
+    dynamics_batch_size: int = static(256, COUNT, "transitions in a minibatch of the dynamics' fit", group="models")
+    surrogate_learning_rate: Any = traced(5e-3, POSITIVE, "Adam's rate for the surrogate reward", group="models")
+    surrogate_updates: int = static(40, COUNT, "gradient steps on the surrogate reward in a round", group="models")
+    surrogate_batch_size: int = static(64, COUNT, "preferences in a minibatch of the surrogate's fit", group="models")
+    surrogate_decay: Any = traced(1e-4, NOT_NEGATIVE, "weight decay of the surrogate's fit", group="models")
+    level: str = static(
         "none", LEVELS, f"what pins the surrogate reward's level after the fit: {', '.join(LEVELS)}", group="models"
     )
 
-    num_queries: int = _static(3_000, COUNT, "queries that the teacher is asked in all", group="queries")
-    segment_length: int = _static(5, COUNT, "steps of the longest segment", group="queries")
-    min_segment_length: int = _static(
+    num_queries: int = static(3_000, COUNT, "queries that the teacher is asked in all", group="queries")
+    segment_length: int = static(5, COUNT, "steps of the longest segment", group="queries")
+    min_segment_length: int = static(
         2, COUNT, "steps of the shortest segment (unequal lengths pin the level)", group="queries"
     )
-    query_strategy: str = _static(
+    query_strategy: str = static(
         "information_gain", STRATEGIES, f"how queries are chosen: {', '.join(STRATEGIES)}", group="queries"
     )
-    candidates_per_query: int = _static(
+    candidates_per_query: int = static(
         10,
         Right(lambda value: COUNT.holds(value) & (value >= 10), "10 or more, or the choice is no choice"),
         "candidate pairs for each query asked",
         group="queries",
     )
 
-    rationality: Any = _traced(
+    rationality: Any = traced(
         1.0, NOT_NEGATIVE, "the human's coefficient on the difference in Eq. (2)'s exponents", group="human"
     )
-    myopia: Any = _traced(
+    myopia: Any = traced(
         1.0, SHARE, "discount towards a segment's past: below 1 the human weighs its end more", group="human"
     )
-    mistake_rate: Any = _traced(0.0, SHARE, "probability of the opposite answer", group="human")
-    indifference: Any = _traced(0.0, NOT_NEGATIVE, "difference below which the human calls it a tie", group="human")
-    skip_below: Any = _traced(
+    mistake_rate: Any = traced(0.0, SHARE, "probability of the opposite answer", group="human")
+    indifference: Any = traced(0.0, NOT_NEGATIVE, "difference below which the human calls it a tie", group="human")
+    skip_below: Any = traced(
         -math.inf, FLOOR, "sum under which both segments make the human skip the query", group="human"
     )
 
@@ -236,7 +213,7 @@ class Config:
         for field in dataclasses.fields(self):
             check_value(field, getattr(self, field.name))
             if field.metadata.get("pytree_node", True):
-                _check_single(field, getattr(self, field.name))
+                check_single(field, getattr(self, field.name))
         _check_problem(self.problem())
         if self.segment_length > self.rollout_length:
             raise ValueError(
@@ -250,46 +227,6 @@ class Config:
 
 
 # --- checks -----------------------------------------------------------------------------------------------------------------
-
-
-def check_value(field: dataclasses.Field, value: Any) -> None:
-    """Raises ValueError if a concrete value of `field`, or any of a batch of them, isn't right."""
-    right, default = field.metadata.get("right"), field.default
-    if right is None or isinstance(value, jax.core.Tracer):
-        return
-    try:
-        good = _is_kind(value, default) and bool(np.all(right.holds(_comparable(value, default))))
-    except (TypeError, ValueError, OverflowError):
-        good = False
-    if good:
-        return
-    if field.metadata["choices"] is not None:
-        raise ValueError(unknown_name(field.name, value, field.metadata["choices"]))
-    raise ValueError(f"{field.name} {shown(value)} is out of range: choose {right.words}")
-
-
-def _is_kind(value: Any, default: Any) -> bool:
-    """Whether `value` is of the kind of `default`: True is no number, 2.5 no whole number."""
-    if isinstance(default, bool | str):
-        return isinstance(value, type(default))
-    if isinstance(default, tuple):
-        return isinstance(value, tuple | list) and len(value) > 0 and all(_is_kind(one, default[0]) for one in value)
-    kind = numbers.Integral if isinstance(default, int) else numbers.Real
-    if isinstance(value, np.ndarray | np.generic | jax.Array):
-        return np.issubdtype(value.dtype, np.integer if kind is numbers.Integral else np.number)
-    return isinstance(value, kind) and not isinstance(value, bool)
-
-
-def _comparable(value: Any, default: Any) -> Any:
-    return value if isinstance(default, bool | str) or isinstance(value, int) else np.asarray(value)
-
-
-def _check_single(field: dataclasses.Field, value: Any) -> None:
-    """Raises ValueError for a batch where one training's value belongs."""
-    if field.name not in ("params", "belief") and np.shape(value):
-        raise ValueError(
-            f"{field.name} has shape {np.shape(value)}: a training takes one value; use jax.vmap(train) for a batch of them"
-        )
 
 
 def _check_problem(problem: Problem) -> None:
@@ -308,12 +245,6 @@ def _check_problem(problem: Problem) -> None:
 
 def _kind(tree: Any) -> str:
     return f"of type {type(tree).__name__}"
-
-
-def shown(value: Any) -> str:
-    """A value as a message shows it, in one line that is not too long."""
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def grid(config: Config, **leaves: Any) -> Config:

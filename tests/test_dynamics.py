@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import LineParams, Point, settings
+from conftest import Line, LineParams, Point, settings
 
 from peps_jax import rollout
+from peps_jax.config import Problem
 from peps_jax.learning import dynamics
 from peps_jax.trajectory import Transition
 
@@ -37,7 +38,29 @@ def fitted(noise, config):
 
 def test_movement_is_in_units_of_the_perceptual_width(line):
     before, after = Point(jnp.array([0.2]), jnp.int32(0)), Point(jnp.array([0.25]), jnp.int32(1))
-    np.testing.assert_allclose(rollout.movement(before, after, line.problem()), [0.05 / WIDTH], rtol=1e-5)
+    moved = rollout.movement(before, after, line.problem())
+    np.testing.assert_allclose(moved, [0.05 / WIDTH], rtol=1e-5)
+    assert moved.dtype == jnp.float32
+
+
+class Pair(Line):
+    """A line on which people see the place in metres and in centimetres, each as well as the other."""
+
+    def perceive(self, state):
+        return jnp.concatenate([state.place, 100 * state.place])
+
+    def perception_width(self, params):
+        return jnp.array([1.0, 100.0]) * params.width
+
+
+def test_every_perceived_number_moves_in_units_of_its_own(line):
+    """Nothing that T_A predicts depends on the units, or on what the agent observes: its observation is one number here."""
+    before, after = Point(jnp.array([0.2]), jnp.int32(0)), Point(jnp.array([0.25]), jnp.int32(1))
+    for width in (0.1, 0.4):
+        problem = Problem(Pair(), LineParams(width=width), LineParams(width=9.0))
+        np.testing.assert_allclose(rollout.movement(before, after, problem), [0.05 / width] * 2, rtol=1e-5)
+    config = line.replace(env=Pair(), params=LineParams(), belief=LineParams())
+    assert settings(config).dynamics.perceived_size == 2
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05, 0.2])

@@ -23,7 +23,7 @@ def evaluate():
 
 @pytest.fixture(scope="module")
 def navigation(tiny, train, evaluate):
-    """D1 with a hardly trained SAC policy that acts at random: the arrays of a real world."""
+    """D1 with a hardly trained SAC policy that acts at random: the arrays of a real domain."""
     config = tiny.replace(method="sac")
     return evaluate(train(config), num_episodes=EPISODES, stochastic=True)
 
@@ -110,6 +110,33 @@ def test_evaluation_is_pure(line, train, evaluate):
     batch = jax.jit(jax.vmap(lambda key: peps_jax.evaluate(result, EPISODES, key=key)))(keys)
     single = evaluate(result, num_episodes=EPISODES, key=keys[1])
     np.testing.assert_allclose(batch.explicability[1], single.explicability, rtol=1e-4, atol=1e-4)
+
+
+def test_by_default_episodes_follow_from_the_trainings_seed(line, train, evaluate):
+    """Under vmap over seeds, a cell's episodes are those of its single run."""
+    result, configs = train(line), peps_jax.grid(line, seed=[0, 3])
+    trained_by = lambda config: result.replace(training=result.training.replace(config=config))
+    batch = jax.jit(jax.vmap(lambda config: peps_jax.evaluate(trained_by(config), EPISODES)))(configs)
+    single = evaluate(trained_by(line.replace(seed=3)), num_episodes=EPISODES)
+    np.testing.assert_allclose(batch.explicability[1], single.explicability, rtol=1e-4, atol=1e-4)
+    assert not np.allclose(batch.perceived[0], batch.perceived[1])
+
+
+def test_another_problem_is_acted_in_and_scored_by(line, train, evaluate):
+    """A belief changes what the same episodes are worth to the human; other parameters change what happens."""
+    result = train(line)
+    own = evaluate(result, num_episodes=EPISODES)
+    scored = lambda params, belief: evaluate(result, num_episodes=EPISODES, problem=Problem(line.env, params, belief))
+    jax.tree.map(np.testing.assert_array_equal, scored(line.params, line.belief), own)
+    other = scored(line.params, LineParams(noise=0.3, slope=-2.0))
+    np.testing.assert_array_equal(other.perceived, own.perceived)
+    np.testing.assert_array_equal(other.return_, own.return_)
+    np.testing.assert_allclose(other.human_return, -2 * own.return_, rtol=1e-5)
+    assert np.all(np.asarray(other.log_belief) < own.log_belief)
+    paid = scored(LineParams(slope=3.0), line.belief)
+    np.testing.assert_allclose(paid.return_, 3 * own.return_, rtol=1e-5)
+    np.testing.assert_allclose(paid.human_return, own.human_return, rtol=1e-5)
+    assert not np.allclose(scored(LineParams(noise=0.2), line.belief).perceived, own.perceived)
 
 
 def test_collected_episodes_score_as_evaluated_ones(line):

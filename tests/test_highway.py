@@ -18,9 +18,9 @@ from peps_envs.environment import event
 from peps_envs.highway import classic, collision, environment, simulation, traffic, vehicle
 from peps_envs.highway.vehicle import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, LANE_WIDTH, SLOWER, Control
 
-RECORDINGS = {  # of highway-env 1.12.1: one behaviour at a time, and dense random traffic
+RECORDINGS = {  # of highway-env 1.12.1: one behaviour at a time, dense random traffic, and headings of pi with ties of places
     f"{name}/{scenario}": (file, scenario)
-    for name in ("parity", "traffic")
+    for name in ("parity", "traffic", "turned")
     for file in (np.load(Path(__file__).parent / f"data/highway_{name}.npz"),)
     for scenario in file["scenarios"]
 }
@@ -88,6 +88,42 @@ def test_a_slow_car_across_the_lane_steers_the_same_way_in_single_precision():
 def test_drivers_wait_as_long_as_sums_in_double_precision_say(hz, steps):
     assert traffic.steps_until(0.0, 1 / hz) == steps
     assert traffic.steps_until(1.1, 1 / hz) == 0
+
+
+def test_a_heading_of_pi_is_the_same_compiled_or_not():
+    angles = np.array([-np.pi, np.pi, 3 * np.pi, -3 * np.pi, 3.14, 0.0, 1e-12, 4.0, -4.0])
+    for kind in (np.float32, np.float64):
+        with jax.enable_x64(kind == np.float64):
+            given = jnp.asarray(angles, kind)
+            found = vehicle.wrap(given)
+            np.testing.assert_array_equal(jax.jit(vehicle.wrap)(given), found)
+            assert found.dtype == kind
+            assert np.all((found >= -kind(np.pi)) & (found < kind(np.pi)))
+            np.testing.assert_array_equal(found[:2], [-kind(np.pi)] * 2)
+            np.testing.assert_allclose(found[4:7], angles[4:7], rtol=1e-6)
+            np.testing.assert_allclose(np.sin(found), np.sin(angles), atol=1e-6)
+
+
+def test_a_meta_action_may_be_a_plain_number():
+    state, _ = reset(jax.random.key(0), TASKS["dry"].params)
+    decide = lambda action: vehicle.decide(state.vehicles, action, jnp.array([20.0, 25.0, 30.0]), 2)
+    for action in range(5):
+        jax.tree.map(np.testing.assert_array_equal, decide(action), decide(jnp.int32(action)))
+
+
+@pytest.mark.parametrize("speed", [46.0, -41.0])
+def test_a_plain_car_that_is_too_fast_is_refused_and_a_braking_one_is_not(speed):
+    """highway-env would repeat the command that first slowed it, 46, 45.4, 44.8, ... m/s, until it drives backwards."""
+    meta = json.loads(str(RECORDINGS["parity/brake_idle"][0]["brake_idle/meta"]))
+    fast = lambda kind: meta | {"vehicles": [meta["vehicles"][0], dict(kind=kind, x=200.0, lane=0, speed=speed)]}
+    with pytest.raises(
+        ValueError, match=rf"vehicle 1 is plain and drives at {speed} m/s: .* slowed to 40 m/s"
+    ) as error:
+        highway.replay(fast("plain"), [1])
+    assert "\n" not in str(error.value)
+    speeds = highway.replay(fast("brake"), [1])["state"][:, 1, 3]
+    assert np.all(np.diff(np.abs(speeds)) < 0), "nearer to 40 m/s in every step"
+    assert np.all(np.abs(speeds) >= 40)
 
 
 def test_scenarios_are_checked():

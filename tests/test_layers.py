@@ -20,9 +20,11 @@ LAYERS = (
     ("peps_envs.highway.simulation", "peps_envs.highway.classic"),
     ("peps_envs.highway",),
     ("peps_envs.registry",),
+    ("peps_envs.*",),  # environments of one file, which register themselves
     ("peps_envs",),
     ("peps_envs.bridges",),
-    ("peps_jax.storage", "peps_jax.command_line", "peps_jax.trajectory"),
+    ("peps_jax.storage", "peps_jax.trajectory"),
+    ("peps_jax.fields",),
     ("peps_jax.config",),
     ("peps_jax.settings",),
     ("peps_jax.round", "peps_jax.preferences"),  # below learning: what r-hat is fitted to is a set of preferences
@@ -35,15 +37,15 @@ LAYERS = (
     ("peps_jax.train", "peps_jax.rollout", "peps_jax.explicability"),
     ("peps_jax.evaluate",),
     ("peps_jax.analysis", "peps_jax.drawing"),
-    (
-        "peps_jax.execution.memory",
-        "peps_jax.execution.compilation_cache",
-        "peps_jax.execution.machine",
-        "peps_jax.execution.devices",
+    *(
+        tuple(
+            f"peps_jax.execution.{name}" for name in ("memory", "compilation_cache", "machine", "devices", "waiting")
+        ),
     ),
     ("peps_jax.execution.program",),
     ("peps_jax.execution.batches",),
     ("peps_jax.execution",),
+    ("peps_jax.command_line",),
     ("peps_jax.sweep",),
     ("peps_jax.reproduce",),
 )
@@ -61,7 +63,8 @@ def layer_of(module: str) -> int | None:
         return LAYER_OF[COMMAND]
     parts = module.split(".")
     rooms = (".".join(parts[:length]) for length in range(len(parts), 1, -1))
-    return next((LAYER_OF[room] for room in rooms if room in LAYER_OF), LAYER_OF.get(module))
+    rest = f"{module.rpartition('.')[0]}.*"
+    return next((LAYER_OF[room] for room in (*rooms, module, rest) if room in LAYER_OF), None)
 
 
 def source_files(root: Path) -> dict[str, Path]:
@@ -78,7 +81,7 @@ def imported(path: Path, module: str, modules: dict[str, Path]) -> set[str]:
     """The project's modules that `path` imports, anywhere in it: `from peps_jax import train` means peps_jax.train."""
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -116,7 +119,7 @@ def plant(root: Path, file: str, text: str) -> None:
         empty = root / path.relative_to(ROOT)
         empty.parent.mkdir(parents=True, exist_ok=True)
         empty.touch()
-    (root / file).write_text(text)
+    (root / file).write_text(text, encoding="utf-8")
 
 
 def test_no_arrow_runs_upwards():
@@ -154,6 +157,22 @@ def test_no_arrow_runs_upwards():
             "from peps_jax import Config",
             "imports peps_jax, which is above it",
         ),
+        (
+            "peps_jax/preferences/data.py",
+            "from peps_jax.learning.surrogate import SurrogateState",
+            "imports peps_jax.learning.surrogate, which is above it",
+        ),
+        (
+            "peps_jax/preferences/queries.py",
+            "from peps_jax.learning import networks",
+            "imports peps_jax.learning.networks, which is above it",
+        ),
+        ("peps_jax/settings.py", "from peps_jax.round import Round", "imports peps_jax.round, which is above it"),
+        ("peps_jax/settings.py", "from .preferences import data", "imports peps_jax.preferences.data, which is above"),
+        ("peps_jax/config.py", "from peps_jax import settings", "imports peps_jax.settings, which is above it"),
+        ("peps_jax/round.py", "import peps_jax.learning.sac", "imports peps_jax.learning.sac, which is above it"),
+        ("peps_jax/trajectory.py", "from peps_jax.config import Problem", "imports peps_jax.config, which is above it"),
+        ("peps_jax/storage/files.py", "from peps_jax import config", "imports peps_jax.config, which is above it"),
         ("peps_jax/learning/sac.py", "from peps_jax.learning import dynamics", "nothing of one another"),
         ("peps_jax/gadgets.py", "", "peps_jax.gadgets has no layer"),
     ],
@@ -172,6 +191,12 @@ def test_a_planted_import_is_caught(tmp_path, file, line, complaint):
             "peps_jax/preferences/synthetic_human.py",
             "from peps_jax.settings import Settings\nfrom peps_jax.config import Config\nimport peps_envs",
         ),
+        (
+            "peps_jax/learning/surrogate.py",
+            "from peps_jax.preferences.data import PreferenceSet\nfrom peps_jax.settings import SurrogateSettings",
+        ),
+        ("peps_jax/preferences/data.py", "from peps_jax.storage import files\nfrom peps_jax import trajectory"),
+        ("peps_jax/round.py", "from peps_jax.settings import ScheduleSettings"),
         ("peps_jax/sweep/command.py", "from peps_jax import Config, evaluate\nimport numpy"),
         ("peps_jax/__init__.py", "from peps_jax.sweep import main"),
     ],
@@ -191,7 +216,7 @@ def test_modules_are_named_for_what_they_are_about():
 
 def test_importing_the_library_imports_neither_brax_nor_matplotlib():
     program = "import sys, peps_envs, peps_jax; print(*({'brax', 'matplotlib'} & set(sys.modules)))"
-    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, encoding="utf-8", check=True).stdout
     assert not printed.split()
 
 
@@ -208,5 +233,7 @@ peps_jax.command_line.use_every_core()
 print(jax.device_count())
 """
     environment = {**os.environ, "XLA_FLAGS": ""}
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env=environment)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, encoding="utf-8", check=True, env=environment
+    )
     assert done.stdout.split() == ["3"]

@@ -1,6 +1,7 @@
-"""That PEPS learns what it should, on a world of the paper's: trained for real, by optimized code in a process of its own."""
+"""That PEPS learns what it should, on a domain of the paper's: trained for real, by optimized code in a process of its own."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -22,8 +23,13 @@ print(json.dumps([leaf.tolist() for leaf in found]))
 
 def test_without_bias_peps_takes_the_agents_own_way_and_with_it_the_humans():
     """Sec. 4: what r-hat adds is the bias. On D4 SAC goes over the ice; a human who believes in slipping expects the sand."""
-    environment = {"PATH": "/usr/bin:/bin", "JAX_PLATFORMS": "cpu"}
-    done = subprocess.run([sys.executable, "-c", TRAINING], capture_output=True, text=True, env=environment)
+    # nothing of the tests' own settings of JAX, but the same code
+    environment = {
+        "PATH": "/usr/bin:/bin",
+        "JAX_PLATFORMS": "cpu",
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+    }
+    done = subprocess.run([sys.executable, "-c", TRAINING], capture_output=True, encoding="utf-8", env=environment)
     assert done.returncode == 0, done.stderr
     goal, returns, explicability, ways = json.loads(done.stdout.splitlines()[-1])
     assert all(map(all, goal))

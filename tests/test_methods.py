@@ -1,4 +1,6 @@
-"""The methods: what each learns from, in which world, and how its policies act together."""
+"""The methods: what each learns from, in which domain, and how its policies act together."""
+
+import math
 
 import chex
 import distrax
@@ -9,10 +11,11 @@ import pytest
 from conftest import LineParams, Probe, ProbeParams, settings
 
 import peps_jax
-from peps_envs import Discrete
+from peps_envs import Box, Discrete
 from peps_jax import Config, methods
 from peps_jax.learning import policy_heads, sac
 from peps_jax.learning.policy_heads import Gaussian
+from peps_jax.methods import Method
 from peps_jax.round import round_at
 from peps_jax.train import collect_and_ask, init, prepare
 from peps_jax.trajectory import Transition
@@ -46,6 +49,64 @@ def test_absolute_entropies_are_more_by_those_of_what_relative_ones_are_measured
     ).entropy()
     uniform = distrax.Independent(distrax.Uniform(-jnp.ones(2), jnp.ones(2)), 1).entropy()
     np.testing.assert_allclose(absolute - relative, 2.0 * (kernel + tiny.policy_entropy_weight * uniform), rtol=1e-4)
+
+
+@pytest.mark.parametrize("space", [Box(2), Discrete(3)])
+def test_what_absolute_entropies_are_more_by_has_a_closed_form(line, space):
+    """n/2 log(2 pi e) + sum_i log sigma_p,i of the kernel, m log 2 or log actions of the uniform policy, each at its weight."""
+    line = line.replace(
+        env=Probe(action_space=space), params=ProbeParams(), belief=ProbeParams(),
+        environment_entropy_weight=0.7, policy_entropy_weight=0.4,
+    )  # fmt: skip
+    kernel = 0.5 * math.log(2 * math.pi * math.e)  # one perceived number, of width 1
+    uniform = 2 * math.log(2) if space == Box(2) else math.log(3)
+    offset = lambda config: settings(config).objective.entropy_offset
+    np.testing.assert_allclose(offset(line.replace(entropies="absolute")), 0.7 * kernel + 0.4 * uniform, rtol=1e-6)
+    assert offset(line) == 0
+    assert offset(line.replace(entropies="relative")) == 0
+
+
+def test_the_kernels_entropy_follows_from_its_width(line):
+    absolute = line.replace(entropies="absolute")
+    offset = lambda width: settings(absolute.replace(params=LineParams(width=width))).objective.entropy_offset
+    np.testing.assert_allclose(offset(0.5) - offset(0.1), math.log(5), rtol=1e-5)
+
+
+# --- defaults -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_method_is_by_default_one_that_learns_nothing_beside_and_acts_in_the_true_domain(line):
+    method, problem, own = Method("nothing", rewards=()), line.problem(), settings(line)
+    assert not method.uses_lam
+    assert not method.asks
+    assert method.acts_in(problem) is problem
+    assert method.settings(own) is own
+    knowledge = method.init(jax.random.key(0), own)
+    assert jax.tree.leaves(knowledge) == []
+    assert method.learn(knowledge, None, None, None, own) == (knowledge, {})
+    assert method.entropy_weight(own) == 0
+    assert method.surrogate(knowledge) is None
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_who_asks_learns_a_surrogate_reward_and_nobody_else(line, name):
+    method = methods.get(name)
+    knowledge = method.init(jax.random.key(0), settings(line))
+    found = method.surrogate(knowledge)
+    assert method.asks == (name in ("peps", "drlhp", "policy_shaping"))
+    assert (found is None) == (not method.asks)
+    assert found is None or found is knowledge.surrogate
+    assert (method.ask is None) == (not method.asks)
+
+
+def test_drlhp_has_its_own_likelihood_and_regularisation_and_the_level_that_is_asked_for(line):
+    told = lambda **changes: settings(line.replace(**changes)).surrogate
+    everyones, drlhp = told(), told(method="drlhp")
+    assert (everyones.uniform_answers, everyones.validates) == (0.0, False)
+    assert (drlhp.uniform_answers, drlhp.validates) == (0.1, True)
+    assert drlhp.replace(uniform_answers=0.0, validates=False) == everyones
+    assert told(method="drlhp", level="standard").level == "standard"
+    assert Config().level == everyones.level == drlhp.level == "none"
 
 
 # --- the product of policies ----------------------------------------------------------------------------------------------
@@ -184,6 +245,31 @@ def test_the_product_and_each_policy_act_in_environments_of_their_own(line):
     assert abs(float(jnp.mean(by_env[:, [0, 3]]))) < 0.3, "the two cancel"
 
 
+@pytest.mark.parametrize("space", [Box(1), Discrete(3)])
+def test_policy_shaping_behaves_in_thirds(line, space):
+    """The product, the first policy and the second one act in every third environment, each with its own chance."""
+    own = settings(line.replace(env=Probe(action_space=space), params=ProbeParams(), belief=ProbeParams())).agent
+    # outputs of two policies that are sure of opposite actions; of the third one of three neither is
+    outputs = ([1.0, -0.5], [-1.0, -0.5]) if space == Box(1) else ([3.0, 0.0, -3.0], [0.0, 3.0, -3.0])
+    agents = ()
+    for output in outputs:
+        agent = sac.init(jax.random.key(0), own)
+        policy = jax.tree.map(jnp.zeros_like, agent.policy)
+        policy["params"]["Dense_1"]["bias"] = jnp.array(output)
+        agents = (*agents, agent.replace(policy=policy))
+    observations, key = jnp.zeros((3001, 1)), jax.random.key(7)  # no multiple of 3
+    acted = np.asarray(methods.get("policy_shaping").behave(agents, observations, key, own))
+    assert acted.shape == ((3001, 1) if space == Box(1) else (3001,))
+    edges = np.linspace(-1, 1, 21) if space == Box(1) else np.arange(4) - 0.5
+    share = lambda actions: np.histogram(actions, edges)[0] / actions.size
+    for third, team in enumerate((agents, agents[:1], agents[1:])):
+        expected = np.asarray(sac.act(team, observations, jax.random.key(8), own)[0])
+        np.testing.assert_allclose(share(acted[third::3]), share(expected), atol=0.07)
+        assert len(np.unique(acted[third::3])) > 1
+    together = methods.get("peps").behave(agents, observations, key, own)
+    np.testing.assert_array_equal(together, sac.act(agents, observations, key, own)[0])
+
+
 def test_the_human_acts_in_the_believed_domain(line, train, evaluate):
     belief = LineParams(noise=0.05, slope=-2.0)
     line = line.replace(method="human_expectation", belief=belief)
@@ -214,3 +300,7 @@ def test_drlhp_as_its_authors_normalised_it(line, train):
     assert len(set(np.asarray(state.scale).tolist())) == config.ensemble_size
     assert "surrogate_validation_ratio" in result.curves
     assert not np.allclose(state.decay, config.surrogate_decay)
+    unscaled = train(line.replace(method="drlhp"))
+    np.testing.assert_array_equal(unscaled.surrogate.shift, 0.0)
+    np.testing.assert_array_equal(unscaled.surrogate.scale, 1.0)
+    assert "surrogate_validation_ratio" in unscaled.curves

@@ -24,7 +24,7 @@ from peps_jax.reproduce.driving import report
 from peps_jax.reproduce.store import Record, Store
 from peps_jax.storage import files
 from peps_jax.storage.ownership import OWNER, Owner, OwnershipLostError, owners
-from peps_jax.sweep import command, journal, pictures, results, underway, workers
+from peps_jax.sweep import command, journal, meeting, pictures, results, underway, workers
 
 # a process that loses its folder inside one of Orbax's calls takes its threads with it; here they come back
 pytestmark = pytest.mark.filterwarnings("ignore:(?s).*Event loop is closed:pytest.PytestUnraisableExceptionWarning")
@@ -61,7 +61,7 @@ ACTS = {
     "a file": lambda folder: files.write_whole(folder / "file", b"late"),
     "a new file": lambda folder: files.write_whole(folder / "inner" / "new", b"late"),
     "a file that something else makes": lambda folder: files.write_with(
-        folder / "file", lambda path: path.write_text("late")
+        folder / "file", lambda path: path.write_text("late", encoding="utf-8")
     ),
     "a folder": lambda folder: files.write_folder(folder / "inner", lambda inner: (inner / "late").touch()),
     "a new folder": lambda folder: files.make_folder(folder / "new" / "newer"),
@@ -214,7 +214,7 @@ def test_commands_write_through_files_alone():
     past = {"write_text", "write_bytes", "savefig", "unlink", "rmtree", "mkdir", "rmdir", "animate", "film", "dump"}
     package = Path(peps_jax.__file__).parent
     for path in [*(package / "sweep").rglob("*.py"), *(package / "reproduce").rglob("*.py")]:
-        tree = ast.parse(path.read_text())
+        tree = ast.parse(path.read_text(encoding="utf-8"))
         named = lambda call: call.func.attr if isinstance(call.func, ast.Attribute) else ""
         calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
         inside = {inner for call in calls if named(call) == "write_with" for inner in ast.walk(call)}
@@ -365,7 +365,8 @@ def test_a_sweep_that_stopped_is_copied_with_its_owner_and_continued(line_task, 
 
 def test_processes_of_one_sweep_lose_their_folder_together(line_task, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(workers, "BEAT", 0.05)
-    monkeypatch.setattr(workers, "join", lambda _, count, index: workers.Team(index, count, "these", count))
+    came = lambda place, wait: workers.Team(place.index, place.count, "these", place.count)
+    monkeypatch.setattr(meeting, "join", came)
     folder, after, advanced, door = tmp_path / "out", {}, underway.Keeper.advanced, threading.Barrier(2)
 
     def take_over(self, *arguments):
@@ -433,7 +434,7 @@ def compiled(tmp_path_factory):
 
 def start(environment, *arguments: object) -> subprocess.Popen:
     words = [sys.executable, "-m", "peps_jax.sweep", *map(str, arguments)]
-    return subprocess.Popen(words, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return subprocess.Popen(words, env=environment, encoding="utf-8", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
 @pytest.mark.slow

@@ -115,6 +115,6 @@ print([one.evaluation.return_.tolist() for one in finished], compiled.bytes_used
 
 def test_another_process_finds_a_trainings_programs(place):
     run = lambda word: (
-        subprocess.run([sys.executable, "-c", PROGRAM, word], capture_output=True, text=True, check=True).stdout
+        subprocess.run([sys.executable, "-c", PROGRAM, word], capture_output=True, encoding="utf-8", check=True).stdout
     )
     assert run("new") == run("known")

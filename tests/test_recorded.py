@@ -81,7 +81,7 @@ _figures = jax.jit(figures)
 def table(folder: Path) -> list[dict[str, str]]:
     """The rows of a small sweep."""
     assert command.main([*SWEEP.split(), "--out", str(folder)]) == 0
-    with open(folder / "results.csv", newline="") as file:
+    with open(folder / "results.csv", newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
@@ -97,7 +97,7 @@ def test_a_short_training_has_the_recorded_numbers(method):
 
 
 def test_a_small_sweep_has_the_recorded_table(tmp_path):
-    with open(TABLE, newline="") as file:
+    with open(TABLE, newline="", encoding="utf-8") as file:
         recorded = list(csv.DictReader(file))
     found = table(tmp_path / "sweep")
     assert [list(row) for row in found] == [list(row) for row in recorded]
@@ -121,7 +121,7 @@ def record() -> None:
     np.savez_compressed(NUMBERS, **numbers)
     with tempfile.TemporaryDirectory() as folder:
         rows = table(Path(folder) / "sweep")
-    with open(TABLE, "w", newline="") as file:
+    with open(TABLE, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)

@@ -62,7 +62,7 @@ def every_need(made: Study) -> dict:
 
 
 def lines_of(path) -> list[dict[str, str]]:
-    with open(path, newline="") as file:
+    with open(path, newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
@@ -87,10 +87,10 @@ def test_bad_input_is_one_line(arguments, parts, tmp_path, capsys, tiny, no_trai
 
 
 def test_a_folder_of_something_else_is_not_written(tmp_path, capsys, tiny, no_training):
-    (tmp_path / "table1.md").write_text("precious")
+    (tmp_path / "table1.md").write_text("precious", encoding="utf-8")
     assert call(["--out", tmp_path], tiny) == 2
     assert "holds no reproduction" in capsys.readouterr().err
-    assert [path.read_text() for path in tmp_path.iterdir()] == ["precious"]
+    assert [path.read_text(encoding="utf-8") for path in tmp_path.iterdir()] == ["precious"]
 
 
 @pytest.mark.parametrize(
@@ -291,7 +291,7 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
     assert len(lines) == len(DOMAINS) * (len(METHODS) + 3) + len(METHODS)
     failing = next(line for line in lines if (line["domain"], line["method"]) == ("nav-d1", "drlhp"))
     assert (failing["seeds"], failing["failed"], failing["return_paper"]) == ("2", "1", "74.51")
-    assert "2 (1 failed)" in (tmp_path / "table1.md").read_text()
+    assert "2 (1 failed)" in (tmp_path / "table1.md").read_text(encoding="utf-8")
     printed = capsys.readouterr().out
     assert "table1.tex" in printed
     assert "figure3 of 4 methods" in printed

@@ -81,7 +81,7 @@ def call(*arguments: object) -> int:
 
 
 def status(folder: Path) -> str:
-    return json.loads((folder / results.MANIFEST).read_text())["status"]
+    return json.loads((folder / results.MANIFEST).read_text(encoding="utf-8"))["status"]
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +214,7 @@ def compiled(tmp_path_factory):
 
 def start(environment, *arguments: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "peps_jax.sweep", *map(str, arguments)]
-    return subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return subprocess.Popen(command, env=environment, encoding="utf-8", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
 @pytest.mark.slow
@@ -301,13 +301,14 @@ def test_a_sweep_with_damaged_files_is_continued(pattern, said, stopped, whole, 
     assert contents(stopped) == whole
 
 
-def test_a_state_is_restored_as_it_was(line, tmp_path):
+@pytest.mark.parametrize("name", ["deep", "tief-größe", "no \udcff text"])
+def test_a_state_is_restored_as_it_was(name, line, tmp_path):
     config = line.replace(method="peps", seed=3)
     state = jax.jit(jax.vmap(program.begin))(program.stack([config, config.replace(seed=4)]))
     progress = program.Progress(
         7, program._on_host(state, 2), {"return_": np.array([[1.0, np.nan]] * 2, np.float32)}, 1.25
     )
-    kept = checkpoints.Checkpoints(tmp_path / "deep" / "folder", {"of": "this"})
+    kept = checkpoints.Checkpoints(tmp_path / name / "folder", {"of": "this"})
     empty = program.empty_progress(config, 2)
     assert kept.latest(empty) is None
     kept.save(progress)
@@ -315,7 +316,7 @@ def test_a_state_is_restored_as_it_was(line, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, restored, progress)
     assert jax.tree.structure(restored.state) == jax.tree.structure(progress.state)
     with pytest.raises(checkpoints.IncompatibleError, match="has of this, not that"):
-        checkpoints.Checkpoints(tmp_path / "deep" / "folder", {"of": "that"}).latest(empty)
+        checkpoints.Checkpoints(tmp_path / name / "folder", {"of": "that"}).latest(empty)
     with pytest.raises(checkpoints.IncompatibleError, match="doesn't have"):
         kept.latest(program.empty_progress(line.replace(method="sac"), 2))
 
@@ -375,18 +376,18 @@ def test_flags_that_agree(stopped, whole):
 
 def change_manifest(folder: Path) -> None:
     path = folder / results.MANIFEST
-    manifest = json.loads(path.read_text())
+    manifest = json.loads(path.read_text(encoding="utf-8"))
     manifest["configuration"]["batch_size"] = 32
-    path.write_text(json.dumps(manifest))
+    path.write_text(json.dumps(manifest), encoding="utf-8")
 
 
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
         (change_manifest, ("was begun with configuration",)),
-        (lambda folder: (folder / results.MANIFEST).write_text("{"), ("manifest.json is broken",)),
+        (lambda folder: (folder / results.MANIFEST).write_text("{", encoding="utf-8"), ("manifest.json is broken",)),
         (lambda folder: (folder / "progress/plan.json").unlink(), ("plan.json is missing",)),
-        (lambda folder: (folder / "progress/plan.json").write_text("{}"), ("is damaged",)),
+        (lambda folder: (folder / "progress/plan.json").write_text("{}", encoding="utf-8"), ("is damaged",)),
         (lambda folder: rewrite(folder / "progress/plan.json", lambda plan: plan.update(format=0)), ("format 0",)),
         (lambda folder: rewrite(folder / "progress/plan.json", lambda plan: plan.update(jax="0.4.2")), ("jax 0.4.2",)),
         (

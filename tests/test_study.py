@@ -241,11 +241,11 @@ def test_bad_input_is_one_line(arguments, parts, tmp_path, capsys):
 
 
 def test_another_study_is_never_replaced_unasked(tmp_path, capsys, monkeypatch):
-    (tmp_path / report.TABLE).write_text("precious")
+    (tmp_path / report.TABLE).write_text("precious", encoding="utf-8")
     assert command.main(["--out", str(tmp_path)]) == 2
     assert "holds another study" in capsys.readouterr().err
-    assert (tmp_path / report.TABLE).read_text() == "precious"
-    assert command.request(["--out", str(tmp_path), "--overwrite"]).out == tmp_path
+    assert (tmp_path / report.TABLE).read_text(encoding="utf-8") == "precious"
+    assert command.request(command.parser().parse(["--out", str(tmp_path), "--overwrite"])).out == tmp_path
 
 
 @pytest.mark.slow
@@ -258,10 +258,10 @@ def test_a_small_study_from_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(experiment, "run", functools.partial(experiment.run, number=3))
     assert command.main(["--seeds", "1", "--steps", "80", "--lams", "2", "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} == set(command.FILES)
-    numbers = json.loads((tmp_path / report.NUMBERS).read_text())
+    numbers = json.loads((tmp_path / report.NUMBERS).read_text(encoding="utf-8"))
     assert set(numbers["ratings"]["mean"]) == {"peps", "sac"}
     assert [line["lam"] for line in numbers["over_lam"]] == [experiment.SETTINGS["lam"]]
-    assert (tmp_path / report.TABLE).read_text() in capsys.readouterr().out
+    assert (tmp_path / report.TABLE).read_text(encoding="utf-8") in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -132,9 +132,11 @@ def test_places_without_an_answer_weigh_nothing(config):
     segments = random_segments(jax.random.key(1), 40)
     preferred = (jnp.arange(40) % 3 == 0).astype(jnp.float32)
     few = data.recording(jax.tree.map(lambda rows: rows[:30], segments), numbered(preferred[:30]))
-    wild = segments._replace(observation=segments.observation.at[30:].set(1e6))
+    wild = segments._replace(
+        observation=segments.observation.at[30:].set(1e6), action=segments.action.at[30:].set(-1e6)
+    )
     more = data.recording(wild, numbered(preferred, (jnp.arange(40) < 30).astype(jnp.float32)))
-    more = more.replace(number=more.number.at[35:].set(data.NOBODY))
+    more = more.replace(number=more.number.at[35:].set(data.NOBODY), preferred=more.preferred.at[30:].set(1e6))
     state = surrogate.init(jax.random.key(0), config.replace(validates=True))
     fit = jax.jit(lambda preferences: surrogate.fit(state, preferences, key, config.replace(validates=True)))
     one, two = fit(few), fit(more)
@@ -153,6 +155,8 @@ def test_it_makes_no_difference_in_which_order_answers_came(config):
     for now, some in ((0, numbers[: NUMBER // 2]), (7, numbers[NUMBER // 2 :])):
         late = data.file(late, Answers(jnp.asarray(some), preferred[some], jnp.ones(len(some))), jnp.asarray(now))
     state = surrogate.init(jax.random.key(0), config)
+    weights = lambda preferences: surrogate._examples(state, preferences, config).weights
+    np.testing.assert_array_equal(weights(late), weights(at_once)[order])  # a member's resample holds the same queries
     fit = jax.jit(lambda preferences: surrogate.fit(state, preferences, jax.random.key(5), config))
     jax.tree.map(
         lambda one, two: np.testing.assert_allclose(one, two, rtol=1e-6, atol=1e-7),
@@ -171,6 +175,24 @@ def test_an_answer_of_three_people_counts_as_three(config):
     examples = surrogate._examples(state, three, config)
     copies = surrogate.resampled(state.bootstrap, jnp.arange(2), config.ensemble_size)
     np.testing.assert_array_equal(examples.weights, copies * np.array([[3.0], [1.0]]))
+
+
+def test_an_answer_of_three_people_costs_as_much_as_three_equal_answers(config):
+    """In the loss and in its gradient: a query's copies in a resample are multiplied, not drawn anew for each person."""
+    state = surrogate.init(jax.random.key(0), config)
+    segments = random_segments(jax.random.key(1), 4)
+    preferred = jnp.array([1.0, 0.0, 0.5, 1.0])
+    weighed = data.recording(segments, numbered(preferred, jnp.array([3.0, 1.0, 2.0, 1.0])))
+    each = jnp.array([0, 0, 0, 1, 2, 2, 3])
+    copied = data.recording(segments, numbered(preferred))
+    copied = jax.tree.map(lambda rows: rows[each], copied)
+    cost = lambda params, rows: surrogate.loss(params, surrogate._examples(state, rows, config), config)
+    (value, accuracy), gradient = jax.value_and_grad(cost, has_aux=True)(state.params, weighed)
+    (same, as_accurate), expected = jax.value_and_grad(cost, has_aux=True)(state.params, copied)
+    np.testing.assert_allclose([value, accuracy], [same, as_accurate], rtol=1e-6)
+    jax.tree.map(lambda one, two: np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-7), gradient, expected)
+    alone = data.recording(segments, numbered(preferred))
+    assert abs(float(cost(state.params, alone)[0] - value)) > 1e-5, "how many people say so counts"
 
 
 def test_fit_recovers_the_ranking_of_a_linear_reward(config):

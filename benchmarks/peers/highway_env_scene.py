@@ -133,7 +133,7 @@ def record(meta: dict, actions: list[int]) -> dict[str, np.ndarray]:
 
 def main() -> None:
     task, source, target = (argument for argument in sys.argv[1:] if argument != "--wait")
-    with open(source) as file:
+    with open(source, encoding="utf-8") as file:
         content = json.load(file)
     if task == "rate":
         rate(content, float(target), "--wait" in sys.argv)

@@ -134,7 +134,7 @@ def rate(count: int, seconds: float, wait: bool) -> None:
 def main() -> None:
     task, *values = [argument for argument in sys.argv[1:] if argument != "--wait"]
     if task == "check":
-        with open(values[0]) as file:
+        with open(values[0], encoding="utf-8") as file:
             print(json.dumps({"difference": largest_difference(json.load(file))}))
     else:
         rate(int(values[0]), float(values[1]), "--wait" in sys.argv)

@@ -9,6 +9,8 @@ It knows the dynamics, the belief and the rewards that a training has to learn, 
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -82,16 +84,7 @@ def solve(
     environment = Navigation()
     acting = belief if objective == "human" else params
     actions = _actions(directions, params.full_action)
-
-    def gain(state: NavigationState, action: Array, position: Array) -> Array:
-        after = NavigationState(position, state.time + 1)
-        if objective == "human":
-            return environment.reward(state, action, after, belief)
-        reward = environment.reward(state, action, after, params)
-        if objective == "return":
-            return reward
-        expected = environment.next_state_distribution(state, action, belief).relative_log_prob(position)
-        return reward + lam * (environment.reward(state, action, after, belief) + expected)
+    gain = functools.partial(_gain, environment, params, belief, objective, lam)
 
     def consequences(position: Array, action: Array) -> tuple[Array, Array, Array]:
         """The expected reward, and the grid's nodes that follow with their discounted weights, (n,) each."""
@@ -105,19 +98,8 @@ def solve(
         index, share = jax.vmap(_corners, in_axes=(0, None, None))(positions, resolution, params.size)
         return reward, index.reshape(-1), (gamma * (weights * ~ended)[:, None] * share).reshape(-1)
 
-    ticks = np.linspace(0, 1, resolution)
-    nodes = jnp.asarray(np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2), jnp.float32) * params.size[None]
     every_action = jax.vmap(consequences, in_axes=(None, 0))
-    # row by row: no remainder, which would be a program of its own
-    rewards, index, weights = jax.lax.map(lambda node: every_action(node, actions), nodes, batch_size=resolution)
-
-    def sweep(carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        values, _ = carry
-        improved = jnp.max(rewards + jnp.sum(weights * values[index], -1), -1)
-        return improved, jnp.max(jnp.abs(improved - values))
-
-    start = jnp.zeros(resolution**2), jnp.inf
-    values, residual = jax.lax.while_loop(lambda carry: carry[1] > tolerance, sweep, start)
+    values, residual = _iterate(lambda node: every_action(node, actions), params.size, resolution, tolerance)
 
     def policy(observation: Array, key: Array | None) -> tuple[Array, Any]:
         del key  # deterministic
@@ -126,6 +108,48 @@ def solve(
         return actions[jnp.argmax(rewards + jnp.sum(weights * values[index], -1))], jnp.zeros(())
 
     return Plan(values=values.reshape(resolution, resolution), residual=residual, policy=policy)
+
+
+def _gain(
+    environment: Navigation,
+    params: NavigationParams,
+    belief: NavigationParams,
+    objective: str,
+    lam: float | Array,
+    state: NavigationState,
+    action: Array,
+    position: Array,
+) -> Array:
+    """What a step to `position` is worth, but for the environment entropy."""
+    after = NavigationState(position, state.time + 1)
+    if objective == "human":
+        return environment.reward(state, action, after, belief)
+    reward = environment.reward(state, action, after, params)
+    if objective == "return":
+        return reward
+    expected = environment.next_state_distribution(state, action, belief).relative_log_prob(position)
+    return reward + lam * (environment.reward(state, action, after, belief) + expected)
+
+
+def _iterate(
+    every_action: Callable[[Array], tuple[Array, Array, Array]], size: Array, resolution: int, tolerance: float
+) -> tuple[Array, Array]:
+    """Value iteration over the grid: its values (resolution^2,), and the last sweep's largest change.
+
+    Args:
+      every_action: a node's position -> of every action the expected reward, and the nodes that follow with their weights.
+    """
+    ticks = np.linspace(0, 1, resolution)
+    nodes = jnp.asarray(np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2), jnp.float32) * size[None]
+    # row by row: no remainder, which would be a program of its own
+    rewards, index, weights = jax.lax.map(every_action, nodes, batch_size=resolution)
+
+    def sweep(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        values, _ = carry
+        improved = jnp.max(rewards + jnp.sum(weights * values[index], -1), -1)
+        return improved, jnp.max(jnp.abs(improved - values))
+
+    return jax.lax.while_loop(lambda carry: carry[1] > tolerance, sweep, (jnp.zeros(resolution**2), jnp.inf))
 
 
 def walk(

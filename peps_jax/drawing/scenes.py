@@ -119,14 +119,20 @@ def strips(clips: Mapping[str, Sequence[Scene]], labels: Sequence[str], note: st
     return figure
 
 
-def film(clips: Mapping[str, Sequence[Scene]], path: Path, rate: float) -> None:
-    """Writes a GIF of `rate` scenes a second: the clips below one another, by their titles; who is done before stands still."""
+def film(
+    clips: Mapping[str, Sequence[Scene]], path: Path, rate: float, across: bool = False, width: float = 6.0
+) -> None:
+    """Writes a GIF of `rate` scenes a second: the clips below one another, or side by side if `across`, by their titles.
+
+    A clip is `width` inches wide. One that is over before the others stands still.
+    """
     from PIL import Image
 
-    figure, grid = panels_of(len(clips), 1, 6.0, 6.0 * _slope(clips) + TITLE)
+    rows, columns = (1, len(clips)) if across else (len(clips), 1)
+    figure, grid = panels_of(rows, columns, width, width * _slope(clips) + TITLE)
     pictures = []
     for place in range(max(map(len, clips.values()))):
-        for axes, (title, clip) in zip(grid[:, 0], clips.items(), strict=True):
+        for axes, (title, clip) in zip(grid.flat, clips.items(), strict=True):
             draw(axes, clip[min(place, len(clip) - 1)])
             axes.set_title(title, color=INK, fontsize=9, loc="left")
         if not pictures:

@@ -15,6 +15,7 @@ import json
 import logging
 import os
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -67,8 +68,22 @@ def prepare() -> None:
 def _orbax() -> Any:
     import orbax.checkpoint
 
-    logging.getLogger("absl").setLevel(logging.ERROR)  # it tells every step
+    logging.getLogger("absl").setLevel(logging.CRITICAL)  # it tells every step, and what it raises a second time
     return orbax.checkpoint
+
+
+@contextlib.contextmanager
+def _spelled_in_unicode(folder: Path) -> Iterator[Path]:
+    """An absolute path of `folder` that Orbax can read: its own or, where that is no Unicode, one that leads there meanwhile."""
+    absolute = folder.absolute()
+    if not any("\ud800" <= character <= "\udfff" for character in str(absolute)):
+        yield absolute
+        return
+    # its name isn't UTF-8, or the locale knows ASCII alone
+    with tempfile.TemporaryDirectory() as aside:
+        link = Path(aside) / "folder"
+        link.symlink_to(absolute, target_is_directory=True)
+        yield link
 
 
 class Checkpoints:
@@ -98,8 +113,11 @@ class Checkpoints:
     def _fill(self, folder: Path, progress: Progress) -> None:
         state = {f"{place:04d}": leaf for place, leaf in enumerate(jax.tree.leaves(progress.state)) if leaf.size}
         try:
-            with _orbax().Checkpointer(_orbax().PyTreeCheckpointHandler()) as checkpointer:
-                checkpointer.save(folder.absolute() / ARRAYS, {"state": state, "curves": dict(progress.curves)})
+            with (
+                _spelled_in_unicode(folder) as place,
+                _orbax().Checkpointer(_orbax().PyTreeCheckpointHandler()) as checkpointer,
+            ):
+                checkpointer.save(place / ARRAYS, {"state": state, "curves": dict(progress.curves)})
         except OSError:
             raise
         except Exception as error:  # what its storage raises has the system's message in it, and no type of its own
@@ -150,8 +168,11 @@ class Checkpoints:
                 f"checkpoint {str(folder)!r} is of a state that this version doesn't have: "
                 "go on with the version that wrote it, or start again with --overwrite"
             )
-        with _orbax().Checkpointer(_orbax().PyTreeCheckpointHandler()) as checkpointer:
-            stored = checkpointer.restore(folder.absolute() / ARRAYS)
+        with (
+            _spelled_in_unicode(folder) as place,
+            _orbax().Checkpointer(_orbax().PyTreeCheckpointHandler()) as checkpointer,
+        ):
+            stored = checkpointer.restore(place / ARRAYS)
         leaves, tree = jax.tree.flatten(empty)
         whole = lambda place, leaf: np.asarray(
             stored["state"][f"{place:04d}"] if leaf.size else np.zeros(leaf.shape, leaf.dtype)

@@ -102,7 +102,7 @@ def _code() -> str:
 def _processor() -> str:
     """What the processor is and can do: a program is made for one."""
     with contextlib.suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0].splitlines()
         return "\n".join(
             line for line in lines if line.split("\t")[0] in ("model name", "flags", "Features", "CPU part")
         )

@@ -92,7 +92,7 @@ def _container_bytes() -> float:
     """What a container's limit leaves; infinite without one. The system's own figure doesn't know of it."""
     folder = Path("/sys/fs/cgroup")
     try:
-        limit, used = ((folder / name).read_text().strip() for name in ("memory.max", "memory.current"))
+        limit, used = ((folder / name).read_text(encoding="utf-8").strip() for name in ("memory.max", "memory.current"))
         return float("inf") if limit == "max" else int(limit) - int(used)
     except (OSError, ValueError):
         return float("inf")

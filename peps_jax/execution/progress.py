@@ -1,8 +1,7 @@
-"""What a command shows of its trainings: progress while they run, a table at the end."""
+"""What a command shows of its trainings while they run."""
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 from peps_jax.config import Config
 from peps_jax.execution import batches, program
 from peps_jax.execution.program import FinishedRun, Times
+from peps_jax.execution.waiting import Reminder, print_line
 
 PATIENCE = 10.0  # s between two lines of progress where there is no terminal
 
@@ -24,7 +24,7 @@ def env_steps(config: Config) -> int:
 
 
 class Display(batches.Watch):
-    """Progress on stderr: a bar on a terminal, a line now and then elsewhere.
+    """Progress on stderr: a bar on a terminal, a line now and then elsewhere. What takes long without any says so.
 
     Args:
       configs: of all cells.
@@ -53,14 +53,17 @@ class Display(batches.Watch):
         self._live = Live(get_renderable=shown, console=console) if console.is_terminal and not name else None
         self._before, self._started = 0, 0.0  # steps and clock at the batch's start
         self._printed = 0.0  # clock at the last line
+        self._reminder = Reminder("beginning", self._remind)
         self._latest = {"return_": float("nan"), "explicability": float("nan")}
 
     def __enter__(self) -> Display:
         if self._live:
             self._live.start(refresh=True)
+        self._reminder.__enter__()
         return self
 
     def __exit__(self, *exception: Any) -> None:
+        self._reminder.__exit__()
         if self._live:
             self._live.stop()
 
@@ -68,8 +71,15 @@ class Display(batches.Watch):
         """What happens now."""
         self._doing = text
         self._bar.update(self._task, description=text)
+        self._reminder.about(text)
         if not self._live:
-            print(f"{self._name}{text}", file=sys.stderr, flush=True)
+            print_line(f"{self._name}{text}")
+
+    def _remind(self, text: str) -> None:
+        if self._live:
+            self._bar.update(self._task, description=text)
+        else:
+            print_line(f"{self._name}{text}")
 
     def compiling(self, batch: batches.Batch) -> None:
         self.say(f"compiling {self._described(batch)}")
@@ -106,12 +116,12 @@ class Display(batches.Watch):
         speed = (self._done - self._before) / (now - self._started)
         returns, explicability = self._latest["return_"], self._latest["explicability"]
         self._figures = f"{speed:,.0f} steps/s, return {returns:.1f}, explicability {explicability:.1f}"
-        self._bar.update(self._task, completed=self._done)
+        self._bar.update(self._task, completed=self._done, description=self._doing)
         if not self._live and (now - self._printed > PATIENCE or self._done == self._total):
             self._printed = now
             share, left = 100 * self._done / self._total, (self._total - self._done) / speed
-            print(
-                f"{self._name}{self._doing}: {share:.0f} %, {left:.0f} s left, {self._figures}",
-                file=sys.stderr,
-                flush=True,
-            )
+            print_line(f"{self._name}{self._doing}: {share:.0f} %, {left:.0f} s left, {self._figures}")
+        if rounds == self._configs[batch.cells[0]].num_rounds:
+            self._reminder.about(f"evaluating {self._described(batch)}")
+        else:
+            self._reminder.about(f"{self._doing}: {rounds} rounds are done, the next ones take")

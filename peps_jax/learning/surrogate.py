@@ -20,7 +20,7 @@ import optax
 from flax import struct
 from jax import Array
 
-from peps_jax.config import MOST
+from peps_jax.fields import MOST
 from peps_jax.learning.networks import MLP, apply_ensemble, feature_size, features_of, init_ensemble
 from peps_jax.preferences.data import PreferenceSet, Segments
 from peps_jax.settings import SurrogateSettings

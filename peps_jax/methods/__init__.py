@@ -1,25 +1,13 @@
-"""The methods by name."""
+"""The methods by name, in the order in which they are listed."""
 
-from peps_envs.registry import unknown_name
-from peps_jax.methods.drlhp import DRLHP
-from peps_jax.methods.human_expectation import HUMAN_EXPECTATION
-from peps_jax.methods.method import Method
-from peps_jax.methods.peps import PEPS
-from peps_jax.methods.policy_shaping import POLICY_SHAPING
-from peps_jax.methods.sac import SAC
+# isort: off
+from peps_jax.methods.peps import PEPS as PEPS
+from peps_jax.methods.sac import SAC as SAC
+from peps_jax.methods.drlhp import DRLHP as DRLHP
+from peps_jax.methods.policy_shaping import POLICY_SHAPING as POLICY_SHAPING
+from peps_jax.methods.human_expectation import HUMAN_EXPECTATION as HUMAN_EXPECTATION
+# isort: on
 
-METHODS = {method.name: method for method in (PEPS, SAC, DRLHP, POLICY_SHAPING, HUMAN_EXPECTATION)}
+from peps_jax.methods.method import METHODS, Method, get, register
 
-
-def get(name: str) -> Method:
-    """The method called `name`.
-
-    Raises:
-      ValueError: no such method; the message says the nearest.
-    """
-    if name not in METHODS:
-        raise ValueError(unknown_name("method", name, METHODS))
-    return METHODS[name]
-
-
-__all__ = ["METHODS", "Method", "get"]
+__all__ = ["METHODS", "Method", "get", "register"]

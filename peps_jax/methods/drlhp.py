@@ -8,6 +8,7 @@ level to r-hat: it was made for tasks without an end, and pays here for staying 
 
 from __future__ import annotations
 
+from peps_jax.methods.method import register
 from peps_jax.methods.preference_based import PREFERENCE_BASED
 from peps_jax.settings import Settings
 
@@ -17,4 +18,4 @@ def own_way(settings: Settings) -> Settings:
     return settings.replace(surrogate=settings.surrogate.replace(uniform_answers=0.1, validates=True))
 
 
-DRLHP = PREFERENCE_BASED._replace(name="drlhp", settings=own_way)
+DRLHP = register(PREFERENCE_BASED._replace(name="drlhp", settings=own_way))

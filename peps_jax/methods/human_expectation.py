@@ -6,8 +6,9 @@ is sum r_H, l_H = l_A, and so the explicability is the return.
 
 from __future__ import annotations
 
+from peps_jax.methods.method import register
 from peps_jax.methods.sac import SAC
 
-HUMAN_EXPECTATION = SAC._replace(
-    name="human_expectation", acts_in=lambda problem: problem.replace(params=problem.belief)
+HUMAN_EXPECTATION = register(
+    SAC._replace(name="human_expectation", acts_in=lambda problem: problem.replace(params=problem.belief))
 )

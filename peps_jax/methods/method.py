@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from jax import Array
 
+from peps_envs.registry import unknown_name
 from peps_jax.config import Problem
 from peps_jax.learning import sac
 from peps_jax.learning.surrogate import SurrogateState
@@ -48,3 +49,28 @@ class Method(NamedTuple):
     behave: Callable[[tuple[sac.Agent, ...], Array, Array, AgentSettings], Array] = each_acts
     # knowledge -> r-hat; None of a method that learns none
     surrogate: Callable[[Any], SurrogateState | None] = lambda knowledge: None
+
+
+METHODS: dict[str, Method] = {}  # by name, in the order in which they were registered
+
+
+def register(method: Method) -> Method:
+    """Gives a method its name for `Config` and the commands.
+
+    Raises:
+      ValueError: another method has that name.
+    """
+    if METHODS.setdefault(method.name, method) is not method:
+        raise ValueError(f"method {method.name!r} is registered already: choose another name")
+    return method
+
+
+def get(name: str) -> Method:
+    """The method called `name`.
+
+    Raises:
+      ValueError: no such method; the message says the nearest.
+    """
+    if name not in METHODS:
+        raise ValueError(unknown_name("method", name, METHODS))
+    return METHODS[name]

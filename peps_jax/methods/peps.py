@@ -8,6 +8,7 @@ from jax import Array
 
 from peps_jax.learning import dynamics, surrogate
 from peps_jax.methods import preference_based
+from peps_jax.methods.method import register
 from peps_jax.methods.preference_based import PREFERENCE_BASED
 from peps_jax.preferences.data import PreferenceSet
 from peps_jax.round import Round
@@ -59,12 +60,14 @@ def reward(knowledge: Knowledge, transitions: Transition, settings: Settings) ->
     return transitions.reward + objective.lam * explicable
 
 
-PEPS = PREFERENCE_BASED._replace(
-    name="peps",
-    rewards=(reward,),
-    uses_lam=True,
-    init=init,
-    learn=learn,
-    # SAC's own temperature explores; Eq. (6)'s comes on top, so that at lambda = 0 PEPS is SAC
-    entropy_weight=lambda settings: settings.objective.lam * settings.objective.policy_entropy_weight,
+PEPS = register(
+    PREFERENCE_BASED._replace(
+        name="peps",
+        rewards=(reward,),
+        uses_lam=True,
+        init=init,
+        learn=learn,
+        # SAC's own temperature explores; Eq. (6)'s comes on top, so that at lambda = 0 PEPS is SAC
+        entropy_weight=lambda settings: settings.objective.lam * settings.objective.policy_entropy_weight,
+    )
 )

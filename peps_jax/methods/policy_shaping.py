@@ -15,6 +15,7 @@ from jax import Array
 
 from peps_jax.learning import sac
 from peps_jax.methods import preference_based
+from peps_jax.methods.method import register
 from peps_jax.methods.preference_based import PREFERENCE_BASED
 from peps_jax.settings import AgentSettings
 
@@ -32,8 +33,10 @@ def act_in_thirds(agents: tuple[sac.Agent, ...], observation: Array, key: Array,
     return jnp.stack(actions, 1)[env, env % len(teams)]
 
 
-POLICY_SHAPING = PREFERENCE_BASED._replace(
-    name="policy_shaping",
-    rewards=(lambda knowledge, transitions, settings: transitions.reward, preference_based.reward),
-    behave=act_in_thirds,
+POLICY_SHAPING = register(
+    PREFERENCE_BASED._replace(
+        name="policy_shaping",
+        rewards=(lambda knowledge, transitions, settings: transitions.reward, preference_based.reward),
+        behave=act_in_thirds,
+    )
 )

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from peps_jax.methods.method import Method
+from peps_jax.methods.method import Method, register
 
-SAC = Method(name="sac", rewards=(lambda knowledge, transitions, settings: transitions.reward,))
+SAC = register(Method(name="sac", rewards=(lambda knowledge, transitions, settings: transitions.reward,)))

@@ -20,6 +20,7 @@ from flax import struct
 from jax import Array
 
 from peps_envs import ActionSpace, Discrete
+from peps_jax.fields import MOST
 from peps_jax.storage import files
 
 NOBODY = -1  # the number of a place without a query
@@ -124,7 +125,19 @@ def recording(segments: Segments, answers: Answers) -> PreferenceSet:
     nothing = jnp.zeros(number.shape, jnp.float32)
     mask = segments.mask.astype(bool)
     asked = PreferenceSet(number, segments.observation, segments.action, mask, nothing, nothing, jnp.zeros_like(number))
-    return file(asked, answers, jnp.zeros((), jnp.int32))
+    return file(_in_32_bits(asked), answers, jnp.zeros((), jnp.int32))
+
+
+def _in_32_bits(preferences: PreferenceSet) -> PreferenceSet:
+    """The set in the types that `empty` states, whatever those who recorded it computed with."""
+
+    def stated(row: Array) -> Array:
+        kind = jnp.result_type(row)
+        if kind == jnp.bool_:
+            return jnp.asarray(row)
+        return jnp.asarray(row, jnp.int32 if jnp.issubdtype(kind, jnp.integer) else jnp.float32)
+
+    return jax.tree.map(stated, preferences)
 
 
 def file(preferences: PreferenceSet, answers: Answers, now: Array) -> PreferenceSet:
@@ -163,6 +176,7 @@ def before(recorded: PreferenceSet | None, room: PreferenceSet, asks: bool) -> P
     """
     if recorded is None:
         return room
+    recorded = _in_32_bits(recorded)
     if asks:
         return joined(recorded, room)
     blank = max(room.number.shape[0] - recorded.number.shape[0], 0)
@@ -193,6 +207,8 @@ def checked(answers: Answers, multiple: int) -> Answers:
     ):
         if not np.all(right):
             raise ValueError(f"answers have {name} {values[~right][0]}: give numbers {words}")
+    # wrapped to 32 bits, a number that no query has would be another one's
+    number = np.where((number >= 0) & (number <= MOST), number, NOBODY)
     blank = -number.size % multiple
     fill = lambda values, value, kind: jnp.asarray(np.pad(values, (0, blank), constant_values=value).astype(kind))
     return Answers(fill(number, NOBODY, np.int32), fill(preferred, 0, np.float32), fill(weight, 0, np.float32))

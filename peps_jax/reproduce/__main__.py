@@ -3,30 +3,32 @@
     python -m peps_jax.reproduce table1 figure1 --out results/reproduce
 
 A stopped command continues where it was. Bad input gets one line on stderr and exit code 2 before anything compiles; Ctrl-C
-keeps the batches that are finished, with exit code 130.
+keeps the batches that are finished, with exit code 130, and so does SIGTERM, with exit code 143.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from peps_envs.registry import unknown_name
-from peps_jax.command_line import Parser, options, refuse, use_every_core
+from peps_jax.command_line import Command, Parser, called, options
 from peps_jax.config import Config
+from peps_jax.execution.waiting import Reminder
 from peps_jax.reproduce import figures, tables
 from peps_jax.reproduce.driving import figure3
 from peps_jax.reproduce.driving.experiment import STEPS
 from peps_jax.reproduce.figures import QUERY_SEEDS
 from peps_jax.reproduce.store import Store
 from peps_jax.reproduce.trainings import DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
-from peps_jax.storage.files import NotWrittenError, OwnershipLostError
 
-PROG = "python -m peps_jax.reproduce"
+PROG = called("peps_jax.reproduce", "peps-reproduce")
 MOST = 1000  # seeds
 DESCRIPTION = f"""\
 The paper's evaluation: {", ".join(METHODS)} on {", ".join(DOMAINS)},
@@ -68,10 +70,7 @@ def parser() -> Parser:
     texts = "\n".join(f"  {name:10} {result.text}" for name, result in RESULTS.items())
     groups = "\n".join(f"  {name:10} {', '.join(members)}" for name, members in GROUPS.items())
     epilog = f"results:\n{texts}\n{groups}\n\nfrontier and ablations take the first {FEW_SEEDS} seeds, queries {QUERY_SEEDS}."
-    made = Parser(
-        prog=PROG, usage=f"{PROG} [RESULT ...] [flags]", description=DESCRIPTION, epilog=epilog, allow_abbrev=False,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    made = Parser(PROG, "[RESULT ...] ", description=DESCRIPTION, epilog=epilog)
     made.add_argument("results", nargs="*", default=["paper"], metavar="RESULT", help="what to reproduce [paper]")
     made.add_argument("--out", default="results/reproduce", metavar="DIR", help="folder [results/reproduce]")
     made.add_argument("--seeds", default=10, help="trainings of each method in each domain [10]", **options(10))
@@ -81,14 +80,12 @@ def parser() -> Parser:
     return made
 
 
-def request(arguments: Sequence[str], base: Config, num_episodes: int) -> Request:
-    """Reads and checks a command line.
+def request(values: argparse.Namespace, base: Config, num_episodes: int) -> Request:
+    """What a command line asks for, and its folder.
 
     Raises:
       ValueError: a value makes no sense, or the folder holds something else.
-      SystemExit: a flag that doesn't exist or can't be read (code 2), or --help (code 0).
     """
-    values = parser().parse(arguments)
     for name in values.results:
         if name not in (*RESULTS, *GROUPS):
             raise ValueError(unknown_name("result", name, (*RESULTS, *GROUPS)))
@@ -109,18 +106,42 @@ def request(arguments: Sequence[str], base: Config, num_episodes: int) -> Reques
     return made
 
 
-def run(wanted: Request) -> list[Path]:
-    """Makes what is missing for each result, and writes it; returns the files."""
-    written = []
-    for name in wanted.names:
-        needs = RESULTS[name].needs(wanted.study)
-        missing = wanted.study.missing(needs, wanted.store)
-        number = len({what.name for what in needs})
-        there = f"{number - len(missing)} of {number} trainings and plans are there" if number else "the driving study"
-        print(f"{name}: {there}", file=sys.stderr, flush=True)
-        wanted.study.make(missing, wanted.store)
-        written += RESULTS[name].write(wanted.study, wanted.store.folder)
-    return written
+class Reproduction:
+    """The results that were asked for, made and written; a stopped one goes on with what is kept."""
+
+    name, makes_checkpoints = "", False
+
+    def __init__(self, wanted: Request):
+        self._wanted = wanted
+
+    def run(self, stop: threading.Event) -> int:
+        """Makes what is missing for each result, writes it, and shows the tables."""
+        wanted, written = self._wanted, []
+        for name in wanted.names:
+            needs = RESULTS[name].needs(wanted.study)
+            missing = wanted.study.missing(needs, wanted.store)
+            number = len({what.name for what in needs})
+            there = (
+                f"{number - len(missing)} of {number} trainings and plans are there" if number else "the driving study"
+            )
+            print(f"{name}: {there}", file=sys.stderr, flush=True)
+            wanted.study.make(missing, wanted.store)
+            with Reminder(f"{name}: computing and drawing"):
+                written += RESULTS[name].write(wanted.study, wanted.store.folder)
+        for path in written:
+            if path.suffix == ".md":
+                print(path.read_text(encoding="utf-8"))
+        print(f"in {wanted.store.folder}: {', '.join(path.name for path in written)}")
+        return 0
+
+    def kept(self) -> str:
+        return f"what is finished is kept in {self._wanted.store.folder}; the same command continues"
+
+    def writing(self) -> contextlib.AbstractContextManager[None]:
+        return self._wanted.store.writing()
+
+    def close(self) -> None:
+        self._wanted.store.close()
 
 
 def main(arguments: Sequence[str] | None = None, base: Config | None = None, num_episodes: int = 100) -> int:
@@ -131,31 +152,8 @@ def main(arguments: Sequence[str] | None = None, base: Config | None = None, num
       base: settings of every training; the package's defaults by default.
       num_episodes: rollouts of each training.
     """
-    use_every_core()
-    arguments = sys.argv[1:] if arguments is None else arguments
-    try:
-        wanted = request(arguments, Config() if base is None else base, num_episodes)
-    except (ValueError, NotWrittenError) as error:
-        return refuse(PROG, error)
-    try:
-        with wanted.store.writing():
-            written = run(wanted)
-    except OwnershipLostError as error:
-        return refuse(PROG, error)
-    except KeyboardInterrupt:
-        print(
-            f"\nstopped: what is finished is kept in {wanted.store.folder}; the same command continues", file=sys.stderr
-        )
-        return 130
-    except NotWrittenError as error:
-        return refuse(PROG, f"{error}; what is finished is kept, and the same command continues")
-    finally:
-        wanted.store.close()
-    for path in written:
-        if path.suffix == ".md":
-            print(path.read_text())
-    print(f"in {wanted.store.folder}: {', '.join(path.name for path in written)}")
-    return 0
+    prepare = lambda values: Reproduction(request(values, Config() if base is None else base, num_episodes))
+    return Command(PROG, lambda given: parser().parse(given), prepare).carry_out(arguments)
 
 
 if __name__ == "__main__":

@@ -94,7 +94,7 @@ class Store:
         if holds_nothing(self.folder):
             return
         try:
-            head = json.loads((self.folder / HEAD).read_text())
+            head = json.loads((self.folder / HEAD).read_text(encoding="utf-8"))
             settings, code, seeds = head["settings"], head["code"], head["seeds"]
         except (OSError, ValueError, KeyError):
             raise ValueError(f"{name} isn't empty and holds no reproduction ({HEAD}): {advice}") from None

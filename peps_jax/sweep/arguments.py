@@ -6,43 +6,45 @@ import argparse
 import dataclasses
 import itertools
 import json
+import os
 import shlex
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import peps_envs
 from peps_jax import methods
-from peps_jax.command_line import Parser, number, options, shown
+from peps_jax.command_line import Parser, called, number, options, shown
 from peps_jax.config import Config
+from peps_jax.preferences import data, teachers
+from peps_jax.preferences.data import PreferenceSet
 from peps_jax.storage import files
-from peps_jax.sweep import results
+from peps_jax.sweep import meeting, results
 from peps_jax.sweep.results import Cell
-from peps_jax.train import check
+from peps_jax.train import check, prepare
 
-PROG = "python -m peps_jax.sweep"
+PROG = called("peps_jax.sweep", "peps-sweep")
 MOST = 100_000  # seeds, and evaluation episodes
 GRID = ("env", "method", "lam")  # fields of which a sweep takes several values
 DEMONSTRATION = {"env": ("nav-d1", "nav-d4"), "method": ("peps", "sac"), "lam": (2.4,)}
 
 DESCRIPTION = """\
-Trains every cell of a grid of worlds, methods, lambdas and seeds, side by side on all
+Trains every cell of a grid of environments, methods, lambdas and seeds, side by side on all
 devices, and writes tables, curves, learned parameters and pictures into a folder.
 Without flags: a demonstration of a few minutes."""
 
-EPILOG = """\
-A method that doesn't use lambda (any but peps) is trained once for each world and seed; its row is
+EPILOG = f"""\
+A method that doesn't use lambda (any but peps) is trained once for each environment and seed; its row is
 repeated for every lambda, so that the table holds the whole grid.
 
 examples:
-  python -m peps_jax.sweep
-  python -m peps_jax.sweep --env nav-d1 nav-d4 --lam 2.0 2.4 2.8 --seeds 8 --out results/mine
-  python -m peps_jax.sweep --env nav-d2 --belief unbiased --hidden-sizes 128 128 --out results/wide"""
+  {PROG}
+  {PROG} --env nav-d1 nav-d4 --lam 2.0 2.4 2.8 --seeds 8 --out results/mine
+  {PROG} --env nav-d2 --belief unbiased --hidden-sizes 128 128 --out results/wide"""
 
 # how a sweep is run, and not what it is: these may change when it is continued
 RUNNING = (
-    "out", "overwrite", "resume", "checkpoint_every", "distributed", "coordinator", "processes", "process",
+    "out", "overwrite", "resume", "checkpoint_every", "distributed", "coordinator", "processes", "process", "wait",
 )  # fmt: skip
 
 TITLES = {
@@ -56,16 +58,26 @@ TITLES = {
 }
 
 
+class Flags(NamedTuple):
+    """A command line, read and not yet understood."""
+
+    arguments: tuple[str, ...]  # as they were typed
+    given: dict[str, Any]  # of `settings`, those that it has
+    settings: dict[str, Any]  # the value of every flag that decides what the sweep is
+    running: dict[str, Any]  # and of those that decide how it is run
+
+
 @dataclasses.dataclass(frozen=True)
 class Request:
     """What a command line asks for, checked."""
 
     cells: list[Cell]  # the grid, in the order of the table
     trainings: dict[str, Config]  # by name; several cells may show one
-    settings: dict[str, Any]  # the value of every flag that decides what the sweep is
-    running: dict[str, Any]  # and of those that decide how it is run
+    settings: dict[str, Any]  # as in `Flags`
+    running: dict[str, Any]
+    preferences: PreferenceSet | None  # recorded, from which all trainings learn
     resume: bool  # continue what the folder holds
-    begun_by: str = ""  # the command that began what is continued
+    begun_by: str  # the command that began it, this one or an earlier one
 
     @property
     def out(self) -> Path:
@@ -84,14 +96,10 @@ class Request:
 
 def parser() -> Parser:
     """The command line's parser, made of `Config`'s fields."""
-    width = min(120, shutil.get_terminal_size((110, 24)).columns)
-    made = Parser(
-        prog=PROG, usage=f"{PROG} [flags]", description=DESCRIPTION, epilog=EPILOG, add_help=False, allow_abbrev=False,
-        formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, max_help_position=34, width=width),
-    )  # fmt: skip
+    made = Parser(PROG, description=DESCRIPTION, epilog=EPILOG, add_help=False)
     group = made.add_argument_group("grid")
     texts = {
-        "env": f"worlds: {', '.join(peps_envs.names())}",
+        "env": f"environments: {', '.join(peps_envs.names())}",
         "method": f"methods: {', '.join(methods.METHODS)}",
         "lam": "reconciliation parameters: weight of explicability against return",
     }
@@ -111,6 +119,8 @@ def parser() -> Parser:
     group.add_argument("--resume", action="store_true", help=text)
     text = "seconds between two checkpoints; 0 for as many as possible [60, or more where they take long]"
     group.add_argument("--checkpoint-every", default=60.0, help=text, **options(60.0))
+    text = "keep what each run's teacher said, in the folder's answers/: a file is what --preferences takes"
+    group.add_argument("--keep-answers", action="store_true", help=text)
     group.add_argument("-h", "--help", action="help", help="show this and exit")
 
     group = made.add_argument_group("several processes, with one results folder that all of them see")
@@ -120,8 +130,12 @@ def parser() -> Parser:
     group.add_argument("--coordinator", metavar="HOST:PORT", help=text)
     group.add_argument("--processes", help="how many there are", **options(2))
     group.add_argument("--process", help="which one this is, from 0", **options(0))
+    text = f"seconds to wait for the others to come and for process 0 to begin [{meeting.WAIT:g}]"
+    group.add_argument("--wait", default=meeting.WAIT, help=text, **options(meeting.WAIT))
 
     groups = {name: made.add_argument_group(title) for name, title in TITLES.items()}
+    text = "learn from these recorded answers, and ask nothing"
+    groups["queries"].add_argument("--preferences", metavar="FILE", help=text)
     for field in dataclasses.fields(Config):
         if field.name in GRID or not field.metadata.get("flag", True):
             continue
@@ -147,8 +161,8 @@ def _hashable(settings: Mapping[str, Any]) -> dict[str, Any]:
     return values | {name: tuple(dict.fromkeys(values[name])) for name in GRID if name in values}
 
 
-def read(arguments: Sequence[str]) -> Request:
-    """Reads and checks a command line.
+def read(arguments: Sequence[str]) -> Flags:
+    """Reads a command line, and checks what decides how a sweep is run.
 
     Raises:
       ValueError: a value makes no sense; one line says which and what would be right.
@@ -157,23 +171,24 @@ def read(arguments: Sequence[str]) -> Request:
     given = _given(arguments)
     settings = _hashable(vars(parser().parse([]))) | given
     running = {name: settings.pop(name) for name in RUNNING}
-    resume, begun_by = running["resume"], ""
-    if resume:
-        if running["overwrite"]:
-            raise ValueError("resume and overwrite can't both be: --resume continues, --overwrite starts again")
-        asked = {name: value for name, value in given.items() if name not in RUNNING}
-        stored, begun_by = _stored(Path(running["out"]))
-        if stored is None and not asked:
-            raise ValueError(
-                f"out {running['out']!r} holds no sweep to continue ({results.MANIFEST} is missing): name its folder, "
-                "or say with other flags what to begin"
-            )
-        if stored is None:
-            resume = False  # the first of many times that a script is run
-        else:
-            _check_agreement(asked, stored, running["out"])
-            settings |= {name: value for name, value in stored.items() if name in settings}
     _check_running(running)
+    given = {name: value for name, value in given.items() if name not in RUNNING}
+    return Flags(tuple(arguments), given, settings, running)
+
+
+def understood(asked: Flags) -> Request:
+    """What a command line asks for. Raises ValueError for what makes no sense, or if the folder holds something else."""
+    settings, running = asked.settings, asked.running
+    out = Path(running["out"])
+    stored, begun_by = _stored(out) if running["resume"] else (None, "")
+    if stored is not None:
+        _check_agreement(asked.given, stored, running["out"])
+        settings = settings | {name: value for name, value in stored.items() if name in settings}
+    elif running["resume"] and not asked.given:  # with other flags it is the first of many times that a script is run
+        raise ValueError(
+            f"out {running['out']!r} holds no sweep to continue ({results.MANIFEST} is missing): name its folder, "
+            "or say with other flags what to begin"
+        )
     for name in ("seeds", "episodes"):
         if not 1 <= settings[name] <= MOST:
             raise ValueError(f"{name} {settings[name]} is out of range: choose 1 to {MOST}")
@@ -181,11 +196,20 @@ def read(arguments: Sequence[str]) -> Request:
     if not 0 <= settings["seed"] <= last:
         raise ValueError(f"seed {settings['seed']} is out of range: choose 0 to {last}")
     cells, trainings = grid(settings)
-    out = Path(running["out"])
-    if not (resume or running["overwrite"]):
+    preferences = None
+    if settings["preferences"] is not None:
+        settings = settings | {"preferences": str(Path(settings["preferences"]).resolve())}
+        preferences = _recorded(settings["preferences"], list(trainings.values()))
+    if stored is None and not running["overwrite"]:
         results.check_free(out)
     files.check_writable(out)
-    return Request(cells, trainings, settings, running, resume, begun_by)
+    begun_by = begun_by or _as_text(shlex.join([*PROG.split(), *asked.arguments]))
+    return Request(cells, trainings, settings, running, preferences, stored is not None, begun_by)
+
+
+def _as_text(command: str) -> str:
+    """A command as UTF-8 has it: a locale that knows ASCII alone took its words for bytes."""
+    return os.fsencode(command).decode("utf-8", "surrogateescape")
 
 
 def grid(settings: Mapping[str, Any]) -> tuple[list[Cell], dict[str, Config]]:
@@ -204,10 +228,22 @@ def grid(settings: Mapping[str, Any]) -> tuple[list[Cell], dict[str, Config]]:
     return cells, trainings
 
 
+def _recorded(file: str, configs: Sequence[Config]) -> PreferenceSet:
+    """The preferences in `file`. Raises ValueError if they can't be read, or are of another environment than a training's."""
+    preferences = data.load(file)
+    asking = [config for config in configs if methods.get(config.method).asks]
+    if not asking:
+        names = ", ".join(name for name, method in methods.METHODS.items() if method.asks)
+        raise ValueError(f"preferences {file!r} would teach nothing: of the methods only {names} learn from any")
+    for config in {(config.env, config.method): config for config in asking}.values():
+        teachers.recorded(preferences).check(True, prepare(config).settings)
+    return preferences
+
+
 def _stored(out: Path) -> tuple[dict[str, Any] | None, str]:
     """The settings of the sweep in `out`, None if there is none, and its command. Raises ValueError if they can't be read."""
     try:
-        manifest = json.loads((out / results.MANIFEST).read_text())
+        manifest = json.loads((out / results.MANIFEST).read_text(encoding="utf-8"))
         return results.tuples(manifest["configuration"]), manifest["command"]
     except (FileNotFoundError, NotADirectoryError):
         return None, ""
@@ -227,8 +263,12 @@ def _check_agreement(asked: Mapping[str, Any], stored: Mapping[str, Any], out: s
 
 
 def _check_running(running: Mapping[str, Any]) -> None:
+    if running["resume"] and running["overwrite"]:
+        raise ValueError("resume and overwrite can't both be: --resume continues, --overwrite starts again")
     if not running["checkpoint_every"] >= 0:
         raise ValueError(f"checkpoint_every {running['checkpoint_every']} is out of range: choose 0 or more seconds")
+    if not 0 < running["wait"] < float("inf"):
+        raise ValueError(f"wait {running['wait']:g} is out of range: choose more than 0 seconds")
     byhand = {name: running[name] for name in ("coordinator", "processes", "process")}
     missing = [name for name, value in byhand.items() if value is None]
     if 0 < len(missing) < len(byhand):

@@ -1,4 +1,4 @@
-"""The command line: trains every cell of a grid of worlds, methods, lambdas and seeds, and writes a results folder.
+"""The command line: trains every cell of a grid of environments, methods, lambdas and seeds, and writes a results folder.
 
     python -m peps_jax.sweep --env nav-d1 nav-d4 --method peps sac --lam 2.0 2.4 2.8 --seeds 8 --out results/mine
     python -m peps_jax.sweep --resume --out results/mine
@@ -15,96 +15,137 @@ and ends with exit code 2. A sweep all of whose cells failed ends with exit code
 from __future__ import annotations
 
 import contextlib
-import shlex
-import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from peps_jax.command_line import refuse, use_every_core
-from peps_jax.execution import checkpoints
+from peps_jax.command_line import Command, Work
+from peps_jax.execution.waiting import Reminder
 from peps_jax.storage import files, ownership
-from peps_jax.sweep import journal, results, workers
-from peps_jax.sweep.arguments import PROG, Request, read
+from peps_jax.sweep import journal, meeting, results, workers
+from peps_jax.sweep.arguments import PROG, Flags, Request, read, understood
 from peps_jax.sweep.results import Row
 from peps_jax.sweep.summary import print_table
-from peps_jax.sweep.underway import StoppedError, Sweep
-
-
-@contextlib.contextmanager
-def terminable() -> Iterator[threading.Event]:
-    """SIGTERM sets the event meanwhile, and ends nothing by itself."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    try:
-        yield stop
-    finally:
-        signal.signal(signal.SIGTERM, before)
+from peps_jax.sweep.underway import Sweep
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code."""
-    use_every_core()
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    try:
-        wanted = read(arguments)
-        if wanted.resume and results.is_complete(wanted.out):
-            return _nothing_to_continue(wanted)
-        by_hand = (wanted.running[name] for name in ("coordinator", "processes", "process"))
-        distributed = wanted.running["distributed"] or wanted.running["coordinator"]
-        team = workers.join(*by_hand) if distributed else workers.alone()
-        sweep = Sweep(wanted, wanted.begun_by or shlex.join([*PROG.split(), *arguments]), team)
-        sweep.begin()
-    except (ValueError, files.NotWrittenError) as error:
-        return refuse(PROG, error)
-    except KeyboardInterrupt:
-        print("\nstopped before anything was trained", file=sys.stderr)
-        return 130
-    try:
-        with sweep.owner.writing():
-            return _run(sweep, wanted, team)
-    except ownership.OwnershipLostError as error:
-        return refuse(PROG, error)
+    return Command(PROG, _read, _prepare).carry_out(arguments)
 
 
-def _run(sweep: Sweep, wanted: Request, team: workers.Team) -> int:
-    """Trains this process's share; the process that leads makes the tables of all. Returns the exit code."""
-    life = workers.Life(wanted.out, team)
-    life.begin()
-    with terminable() as stop:
-        try:
+def _read(arguments: Sequence[str]) -> tuple[Flags, meeting.Place | None]:
+    """The flags, and where this process joins the others if it is one of several: a cluster may give it devices of its own."""
+    asked = read(arguments)
+    if not (asked.running["distributed"] or asked.running["coordinator"]):
+        return asked, None
+    place = meeting.find(*(asked.running[name] for name in ("coordinator", "processes", "process")))
+    meeting.use_own_accelerators(place)
+    return asked, place
+
+
+def _prepare(read: tuple[Flags, meeting.Place | None]) -> Work:
+    """Makes sure that all of it makes sense, waits for the other processes, and takes the folder."""
+    asked, place = read
+    wanted = understood(asked)
+    if wanted.resume and results.is_complete(wanted.out):
+        return NothingToContinue(wanted)
+    team = workers.alone() if place is None else meeting.join(place, wanted.running["wait"])
+    sweep = Sweep(wanted, team)
+    sweep.begin()
+    return Training(wanted, team, sweep)
+
+
+class Training:
+    """A sweep, or this process's share of it: trained, gathered, and shown."""
+
+    makes_checkpoints = True
+
+    def __init__(self, wanted: Request, team: workers.Team, sweep: Sweep):
+        self._wanted, self._team, self._sweep = wanted, team, sweep
+        self.name = team.name
+
+    def run(self, stop: threading.Event) -> int:
+        """Trains this process's share; the process that leads makes the tables of all."""
+        sweep = self._sweep
+        with workers.Life(self._wanted.out, self._team) as life:
             sweep.run(stop)
-            if not team.leads:
-                life.end(workers.DONE)
-                print(f"{team.name}: its share is done; process 0 makes the tables", file=sys.stderr)
-                return 0
-            wrong = sweep.gather(stop)
+            if not self._team.leads:
+                return _share_done(self._wanted, self._team, life.others.ends().get(0))
+            wrong = sweep.gather(stop, life.others)
             if not sweep.complete:
-                return _incomplete(sweep, wanted, wrong)
+                return self._incomplete(wrong)
             rows = sweep.rows()
-            pictures = _draw(rows, wanted.out)
-            life.end(workers.DONE)
-            sweep.close()
-        except (KeyboardInterrupt, StoppedError) as reason:
-            life.end(workers.STOPPED, "asked to")
-            who = f"{team.name} " if team.name else ""
-            print(f"\n{who}stopped: {_kept(sweep, wanted)}", file=sys.stderr)
-            return 130 if isinstance(reason, KeyboardInterrupt) else 143
-        except ownership.OwnershipLostError as error:
-            life.end(workers.FAILED, str(error))
+            pictures = _draw(rows, self._wanted.out)
+        sweep.close()
+        return _tell(rows, self._wanted, pictures)
+
+    def kept(self) -> str:
+        """Writes the tables of what is finished, and tells how to go on. Raises OwnershipLostError."""
+        self._sweep.owner.check()
+        try:
+            self._sweep.save("interrupted")
+        except ownership.OwnershipLostError:
             raise
-        except (files.NotWrittenError, checkpoints.IncompatibleError) as error:
-            life.end(workers.FAILED, str(error))
-            return refuse(PROG, f"{error}; {_kept(sweep, wanted)}")
-        except Exception as error:
-            life.end(workers.FAILED, f"{type(error).__name__}: {error}".splitlines()[0])
-            print(f"failed: {_kept(sweep, wanted)}", file=sys.stderr)
-            raise
-    return _tell(rows, wanted, pictures)
+        except files.NotWrittenError:  # the cells' own files are there, and make them again
+            pass
+        done = len(self._sweep.rows())  # of a process that doesn't lead: its own
+        kept = f"{done} of {len(self._wanted.cells)} cells are finished" + f" and kept in {self._wanted.out}" * (
+            done > 0
+        )
+        return f"{kept}; continue with: {self._wanted.continued}"
+
+    def writing(self) -> contextlib.AbstractContextManager[None]:
+        return self._sweep.owner.writing()
+
+    def close(self) -> None:
+        """Nothing: the folder of a sweep that isn't complete stays its own, until `--resume` takes it."""
+
+    def _incomplete(self, wrong: Mapping[int, str]) -> int:
+        kept = self.kept()
+        for index, reason in wrong.items():
+            print(f"process {index} didn't finish: {reason}", file=sys.stderr)
+        print(f"incomplete: {kept}", file=sys.stderr)
+        return 1
+
+
+class NothingToContinue:
+    """A sweep that is complete already."""
+
+    name, makes_checkpoints = "", False
+
+    def __init__(self, wanted: Request):
+        self._wanted = wanted
+
+    def run(self, stop: threading.Event) -> int:
+        """Says so, and clears up if it was killed just then."""
+        out = self._wanted.out
+        if journal.is_open(out):
+            _clear_up(out)
+        failed = results.all_failed(out)
+        cells = f"{len(self._wanted.cells)} cells"
+        print(f"{out} is complete: {cells}, nothing to continue" + ", and all of them failed" * failed)
+        return 1 if failed else 0
+
+    def kept(self) -> str:
+        return f"{self._wanted.out} is complete"
+
+    def writing(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext()
+
+    def close(self) -> None:
+        """Nothing: it owns nothing."""
+
+
+def _share_done(wanted: Request, team: workers.Team, end: str | None) -> int:
+    """Says that a process that doesn't lead has done its part, while process 0 has come to that end; returns the exit code."""
+    if end in (None, workers.DONE):
+        print(f"{team.name}: its share is done; process 0 makes the tables", file=sys.stderr)
+        return 0
+    left = f"process 0, which makes the tables, doesn't go on ({end}); continue with: {wanted.continued}"
+    print(f"{team.name}: its share is done and kept, but {left}", file=sys.stderr)
+    return 1
 
 
 def _tell(rows: Sequence[Row], wanted: Request, pictures: Sequence[str]) -> int:
@@ -122,18 +163,6 @@ def _tell(rows: Sequence[Row], wanted: Request, pictures: Sequence[str]) -> int:
     return 0
 
 
-def _nothing_to_continue(wanted: Request) -> int:
-    """Says that the sweep is complete, and clears up if it was killed just then; returns the exit code."""
-    if journal.is_open(wanted.out):
-        _clear_up(wanted.out)
-    failed = results.all_failed(wanted.out)
-    print(
-        f"{wanted.out} is complete: {len(wanted.cells)} cells, nothing to continue"
-        + ", and all of them failed" * failed
-    )
-    return 1 if failed else 0
-
-
 def _clear_up(folder: Path) -> None:
     """Removes what a sweep that is complete has left, unless somebody else has the folder now."""
 
@@ -149,33 +178,12 @@ def _clear_up(folder: Path) -> None:
         owner.release()
 
 
-def _kept(sweep: Sweep, wanted: Request) -> str:
-    """Writes the tables of what is finished, and tells how to go on. Raises OwnershipLostError."""
-    sweep.owner.check()
-    try:
-        sweep.save("interrupted")
-    except ownership.OwnershipLostError:
-        raise
-    except files.NotWrittenError:  # the cells' own files are there, and make them again
-        pass
-    done = len(sweep.rows())  # of a process that doesn't lead: its own
-    kept = f"{done} of {len(wanted.cells)} cells are finished" + f" and kept in {wanted.out}" * (done > 0)
-    return f"{kept}; continue with: {wanted.continued}"
-
-
-def _incomplete(sweep: Sweep, wanted: Request, wrong: Mapping[int, str]) -> int:
-    kept = _kept(sweep, wanted)
-    for index, reason in wrong.items():
-        print(f"process {index} didn't finish: {reason}", file=sys.stderr)
-    print(f"incomplete: {kept}", file=sys.stderr)
-    return 1
-
-
 def _draw(rows: Sequence[Row], folder: Path) -> list[str]:
     from peps_jax.sweep import pictures  # matplotlib takes its time
 
     print("drawing", file=sys.stderr)
-    return [path.name for path in pictures.draw(rows, folder)]
+    with Reminder("drawing"):
+        return [path.name for path in pictures.draw(rows, folder)]
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ import numpy as np
 from peps_jax.config import Config
 from peps_jax.execution.checkpoints import FORMAT, Checkpoints
 from peps_jax.execution.program import FinishedRun, Times, shared
+from peps_jax.preferences.data import PreferenceSet
 from peps_jax.storage import files, ownership
 from peps_jax.sweep import results
 
@@ -56,14 +57,16 @@ class Ledger:
 
     Args:
       about: what has to be the same for a sweep to be continued: versions, settings. JSON knows it.
+      keeps_answers: whether what teachers said is kept.
 
     Raises:
       NotWrittenError: from whatever writes, if there is no room or no permission.
     """
 
-    def __init__(self, folder: Path, about: Mapping[str, Any]):
+    def __init__(self, folder: Path, about: Mapping[str, Any], keeps_answers: bool = False):
         self.folder = folder / FOLDER
         self._results = folder
+        self._keeps_answers = keeps_answers
         self._about = {"format": FORMAT, **about}
 
     def begin(self, plan: Plan) -> None:
@@ -116,6 +119,9 @@ class Ledger:
 
     def commit(self, number: int, cells: Mapping[str, FinishedRun], times: Times) -> None:
         """Writes the cells' files, and then that batch `number` is done; it needs no checkpoint any more."""
+        if self._keeps_answers:
+            for training, finished in cells.items():
+                results.write_answers(self._results, training, finished)
         sums = {training: results.write_cell(self._results, training, finished) for training, finished in cells.items()}
         content = {"cells": sums, "times": times._asdict()}
         files.write_whole(self.folder / f"{_name(number)}.json", files.seal(files.json_bytes(content)))
@@ -154,9 +160,9 @@ def clear(folder: Path) -> None:
     files.remove(folder / FOLDER)
 
 
-def numbers_digest(cells: Sequence[Config]) -> str:
-    """A checksum of all numbers of `cells`, their worlds' among them: a changed default is a changed configuration."""
-    leaves = jax.tree.leaves([shared(cell) for cell in cells])
+def numbers_digest(cells: Sequence[Config], preferences: PreferenceSet | None = None) -> str:
+    """A checksum of all numbers that `cells` learn from, their environments' among them: a changed default is a changed one."""
+    leaves = jax.tree.leaves([[shared(cell) for cell in cells], preferences])
     return files.digest(b"".join(np.asarray(leaf).tobytes() for leaf in leaves))
 
 

@@ -3,6 +3,7 @@
     manifest.json    command, settings, versions, devices, times, cells
     results.csv      one row for each cell of the grid
     curves.npz       `env_steps` (rounds,), and every curve (cells, rounds) in the order of the rows; nan where a method has none
+    answers/*.npz    what each training's teacher said, where that was asked for; see `peps_jax.preferences.data`
     cells/*.msgpack  what each training learned and how it was evaluated, behind a line with the file's checksum
     *.png            pictures, see `peps_jax.sweep.pictures`
     progress/        how far an unfinished sweep is, see `peps_jax.sweep.journal`
@@ -33,11 +34,12 @@ from peps_jax.config import Config
 from peps_jax.evaluate import Evaluation
 from peps_jax.execution import machine
 from peps_jax.execution.program import FinishedRun, Times, empty_finished
+from peps_jax.preferences import data
 from peps_jax.storage import files
 from peps_jax.storage.tables import csv_bytes
 from peps_jax.train import Result, init, prepare
 
-MANIFEST, TABLE, CURVES, CELLS = "manifest.json", "results.csv", "curves.npz", "cells"
+MANIFEST, TABLE, CURVES, CELLS, ANSWERS = "manifest.json", "results.csv", "curves.npz", "cells", "answers"
 PICTURES = ("learning_curves.png", "frontier.png", "routes.png", "surrogate.png")
 KEYS = ("env", "method", "lam", "seed")  # what tells a grid's cells apart
 
@@ -84,7 +86,7 @@ def check_free(folder: Path) -> None:
 def is_complete(folder: Path) -> bool:
     """Whether the sweep in `folder` has nothing left to do."""
     try:
-        return json.loads((folder / MANIFEST).read_text()).get("status") == "complete"
+        return json.loads((folder / MANIFEST).read_text(encoding="utf-8")).get("status") == "complete"
     except (OSError, ValueError):
         return False
 
@@ -129,6 +131,13 @@ def record(row: Row) -> dict[str, Any]:
 # --- writing --------------------------------------------------------------------------------------------------------------
 
 
+def write_answers(folder: Path, training: str, run: FinishedRun) -> None:
+    """Writes what a training's teacher said, if it had one. Raises NotWrittenError."""
+    if run.preferences is not None:
+        files.make_folder(folder / ANSWERS)
+        data.save(folder / ANSWERS / f"{training}.npz", run.preferences)
+
+
 def write_cell(folder: Path, training: str, run: FinishedRun) -> str:
     """Writes what a training left; returns the file's checksum. Raises NotWrittenError."""
     path = folder / CELLS / f"{training}.msgpack"
@@ -171,7 +180,7 @@ def clear(folder: Path) -> None:
     """Removes a sweep's files; others stay. The manifest goes first: without it nothing is taken for results."""
     for name in (MANIFEST, TABLE, CURVES, *PICTURES):
         files.remove(folder / name)
-    for path in (folder / CELLS).glob("*.msgpack"):
+    for path in (*(folder / CELLS).glob("*.msgpack"), *(folder / ANSWERS).glob("*.npz")):
         files.remove(path)
 
 
@@ -249,7 +258,7 @@ def load(folder: str | os.PathLike[str], cell: int | str | Mapping[str, Any]) ->
     """
     folder = Path(folder)
     try:
-        manifest = json.loads((folder / MANIFEST).read_text())
+        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
         cells, configuration = manifest["cells"], manifest["configuration"]
     except (OSError, ValueError, KeyError):
         raise ValueError(f"folder {str(folder)!r} holds no sweep's results: {MANIFEST} is missing or broken") from None
@@ -273,7 +282,9 @@ def load(folder: str | os.PathLike[str], cell: int | str | Mapping[str, Any]) ->
         reason = str(error).splitlines()[0]
         raise ValueError(f"file {str(path)!r} was written by a version that doesn't fit this one: {reason}") from None
     config = config.replace(params=parts["params"], belief=parts["belief"])
-    return Result(prepare(config), parts["agents"], parts["knowledge"], None, curves)
+    answers = folder / ANSWERS / f"{path.stem}.npz"
+    preferences = data.load(answers) if answers.exists() else None
+    return Result(prepare(config), parts["agents"], parts["knowledge"], preferences, curves)
 
 
 def _find(cells: Sequence[Mapping[str, Any]], wanted: int | str | Mapping[str, Any]) -> Mapping[str, Any]:

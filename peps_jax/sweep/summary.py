@@ -14,7 +14,7 @@ from peps_jax.sweep.results import Row
 
 
 def print_table(rows: Sequence[Row]) -> None:
-    """A line for each world, method and lambda: mean and standard deviation over the seeds that didn't fail."""
+    """A line for each environment, method and lambda: mean and standard deviation over the seeds that didn't fail."""
     from rich import box
     from rich.console import Console
     from rich.table import Table

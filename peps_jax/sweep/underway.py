@@ -11,10 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 import jax
 import numpy as np
 
+from peps_jax.command_line import StoppedError
 from peps_jax.execution import batches, checkpoints, machine, memory
 from peps_jax.execution.devices import side_by_side
 from peps_jax.execution.program import FinishedRun, Progress, Times, empty_progress
 from peps_jax.execution.progress import Display, env_steps
+from peps_jax.execution.waiting import Reminder
+from peps_jax.preferences.data import PreferenceSet
 from peps_jax.storage import files
 from peps_jax.storage.ownership import Owner
 from peps_jax.sweep import journal, results, workers
@@ -22,16 +25,11 @@ from peps_jax.sweep.arguments import Request
 from peps_jax.sweep.results import Row
 
 
-class StoppedError(Exception):
-    """The process was asked to end, and has made a checkpoint."""
-
-
 class Sweep:
     """A request on its way: what is finished, and its folder, which is this sweep's from `begin` to `close`.
 
     Args:
       wanted: what is to be trained.
-      command: that began it.
       team: the processes that share it.
 
     Raises:
@@ -39,18 +37,23 @@ class Sweep:
       OwnershipLostError: from whatever writes, if the folder is another's now.
     """
 
-    def __init__(self, wanted: Request, command: str, team: workers.Team):
+    def __init__(self, wanted: Request, team: workers.Team):
         self.owner = Owner(wanted.out, team.run)
         self.batches: dict[int, batches.Batch] = {}  # this process's, by number
         self._wanted, self._team = wanted, team
         self._configs = list(wanted.trainings.values())
         self._places = {name: place for place, name in enumerate(wanted.trainings)}
-        self._writer = results.Writer(wanted.out, command, wanted.settings)
-        self._ledger = journal.Ledger(wanted.out, _about(wanted))
+        self._writer = results.Writer(wanted.out, wanted.begun_by, wanted.settings)
+        self._ledger = journal.Ledger(wanted.out, _about(wanted), wanted.settings["keep_answers"])
         self._finished: dict[str, FinishedRun] = {}
         self._times, self._env_steps = Times(), 0
         self._tables = checkpoints.Rhythm(1.0)
         self._plan = journal.Plan((), (), "")
+
+    @property
+    def recorded(self) -> PreferenceSet | None:
+        """Preferences from which all trainings learn."""
+        return self._wanted.preferences
 
     # who does what
 
@@ -60,7 +63,11 @@ class Sweep:
         Raises:
           ValueError: the sweep doesn't fit in memory, or the folder is another's or doesn't hold what is to be continued.
         """
-        self._plan = self._share_out() if self._team.leads else self._shared_out()
+        if self._team.leads:
+            with Reminder("planning what runs with what"):
+                self._plan = self._share_out()
+        else:
+            self._plan = self._shared_out()
         share = self._plan.shares[self._team.index]
         self.batches = {number: self._batch(self._plan.batches[number]) for number in share}
 
@@ -113,20 +120,25 @@ class Sweep:
         if self._team.neighbours > 1 and not side_by_side(devices):
             free = memory.available_bytes(devices) // self._team.neighbours
         most = batches.cells_soon_done(devices)
-        return batches.plan(self._configs, self._wanted.episodes, devices, free, most, self._team.count)
+        return batches.plan(self._configs, self._wanted.episodes, devices, free, most, self._team.count, self.recorded)
 
     def _shared_out(self) -> journal.Plan:
-        """Waits for process 0 to share out the batches."""
-        end = time.monotonic() + workers.PATIENCE
-        while time.monotonic() < end:
-            with contextlib.suppress(ValueError):
-                plan = self._ledger.plan()
-                if plan.run == self._team.run:
-                    return plan
-            time.sleep(0.1)
+        """Waits for process 0 to share out the batches. Raises ValueError if it doesn't."""
+        out, wait = str(self._wanted.out), self._wanted.running["wait"]
+        end = time.monotonic() + wait
+        with Reminder(f"{self._team.name} waits for process 0 to share out the batches in {out!r}"):
+            while time.monotonic() < end:
+                with contextlib.suppress(ValueError):
+                    plan = self._ledger.plan()
+                    if plan.run == self._team.run:
+                        return plan
+                if self._wanted.resume and results.is_complete(self._wanted.out):
+                    # it wasn't when this process looked first: process 0 had little left to do, and did it
+                    return journal.Plan((), ((),) * self._team.count, self._team.run)
+                time.sleep(0.1)
         raise ValueError(
-            f"out {str(self._wanted.out)!r}: process 0 hasn't shared out the batches in {workers.PATIENCE} s; "
-            "see what it says, and that every process sees this folder"
+            f"out {out!r}: process 0 hasn't shared out the batches in {wait:g} s; see what it says, and that every process sees "
+            "this folder (--wait says how long to wait)"
         )
 
     def _batch(self, planned: journal.Planned) -> batches.Batch:
@@ -157,7 +169,8 @@ class Sweep:
         """Writes a batch that this process has finished."""
         cells = dict(zip(self._plan.batches[number].trainings, finished, strict=True))
         self._ledger.commit(number, cells, times)
-        self._take(cells, times)
+        # tables and pictures show none of the preferences, which are most of what a run leaves
+        self._take({name: run.replace(preferences=None) for name, run in cells.items()}, times)
 
     def _take(self, cells: Mapping[str, FinishedRun], times: Times) -> None:
         self._finished |= cells
@@ -193,30 +206,31 @@ class Sweep:
         """
         checkpoints.prepare()
         with Keeper(self, stop) as keeper:
-            batches.run(self._configs, list(self.batches.values()), self._wanted.episodes, keeper)
+            batches.run(self._configs, list(self.batches.values()), self._wanted.episodes, keeper, self.recorded)
 
-    def gather(self, stop: threading.Event) -> dict[int, str]:
+    def gather(self, stop: threading.Event, others: workers.Others) -> dict[int, str]:
         """Takes in what the other processes finish, until all have ended; what went wrong, by process."""
         if self._team.count == 1 or not self._team.leads:
             return {}
-        others = workers.Others(self._wanted.out, self._team)
+        ends, end = {}, None
         left = {number for share in self._plan.shares[1:] for number in share}
-        patience = None
-        while True:
-            if stop.is_set():
-                raise StoppedError
-            self.owner.check()
-            ends = others.ends()
-            left -= {number for number in left if self._read(number, self._plan.batches[number])}
-            if not left or len(ends) == self._team.count - 1:
-                # a shared folder may show the file of a batch later than the sign that its process is done
-                patience = time.monotonic() + workers.LATE if patience is None else patience
-                late = [
-                    number for index, end in ends.items() if end == workers.DONE for number in self._plan.shares[index]
-                ]
-                if not left.intersection(late) or time.monotonic() > patience:
-                    return {index: end for index, end in ends.items() if end != workers.DONE}
-            time.sleep(0.2)
+        going_on = lambda: sorted({*range(1, self._team.count)} - ends.keys())
+        batches_left = lambda: f"{len(left)} batch{'es' * (len(left) != 1)} left"
+        with Reminder(lambda: f"process 0 waits for {workers.numbered(going_on())}, {batches_left()}"):
+            while True:
+                if stop.is_set():
+                    raise StoppedError
+                self.owner.check()
+                ends = others.ends()
+                left -= {number for number in left if self._read(number, self._plan.batches[number])}
+                if not left or not going_on():
+                    # a shared folder may show the file of a batch later than the sign that its process is done
+                    end = time.monotonic() + workers.LATE if end is None else end
+                    done = [index for index, how in ends.items() if how == workers.DONE]
+                    late = {number for index in done for number in self._plan.shares[index]}
+                    if not left & late or time.monotonic() > end:
+                        return {index: how for index, how in ends.items() if how != workers.DONE}
+                time.sleep(0.2)
 
     def checkpoints(self, number: int) -> checkpoints.Checkpoints:
         return self._ledger.checkpoints(number, [self._configs[place] for place in self.batches[number].cells])
@@ -243,7 +257,7 @@ class Keeper(Display):
             raise StoppedError
         self._checkpoints = self._sweep.checkpoints(self._number_of[current])
         first = self._configs[current.cells[0]]
-        progress = self._checkpoints.latest(empty_progress(first, len(current.cells)))
+        progress = self._checkpoints.latest(empty_progress(first, len(current.cells), self._sweep.recorded))
         self.begin(current, progress.rounds if progress else 0)
         return progress
 
@@ -271,7 +285,7 @@ def _about(wanted: Request) -> dict[str, str]:
     told = machine.describe()
     versions = {name: told["versions"][name] for name in ("peps-jax", "jax", "jaxlib")}
     device = jax.devices()[0]
-    numbers = journal.numbers_digest(list(wanted.trainings.values()))
+    numbers = journal.numbers_digest(list(wanted.trainings.values()), wanted.preferences)
     return versions | {
         "devices": f"{device.platform} {device.device_kind}",
         "configuration": files.json_digest([files.plain(wanted.settings), numbers]),

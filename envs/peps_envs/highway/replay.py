@@ -45,7 +45,7 @@ def place(meta: Mapping[str, Any]) -> tuple[Vehicles, Drivers]:
     """The vehicles and drivers that a scenario starts with.
 
     Raises:
-      ValueError: a kind of vehicle that doesn't exist, or an ego elsewhere than first.
+      ValueError: a kind of vehicle that doesn't exist, an ego elsewhere than first, or a plain car that is too fast.
     """
     kinds = [spec["kind"] for spec in meta["vehicles"]]
     for kind in kinds:
@@ -53,6 +53,13 @@ def place(meta: Mapping[str, Any]) -> tuple[Vehicles, Drivers]:
             raise ValueError(f"vehicle kind {kind!r} is unknown: known are {', '.join(KINDS)}")
     if [kind == "ego" for kind in kinds] != [index == 0 for index in range(len(kinds))]:
         raise ValueError(f"kinds {', '.join(kinds)}: the first vehicle has to be the ego, and no other")
+    for index, spec in enumerate(meta["vehicles"]):
+        if spec["kind"] == "plain" and abs(spec["speed"]) > vehicle.MAX_SPEED:
+            raise ValueError(
+                f"vehicle {index} is plain and drives at {spec['speed']} m/s: highway-env would repeat the command that first "
+                f"slows it until it drives backwards, where here it is slowed to {vehicle.MAX_SPEED:g} m/s; choose at most that, "
+                "or the kind 'brake'"
+            )
     dt, grid = 1 / meta["sim_hz"], np.asarray(meta["target_speeds"], float)
     rows = []
     for kind, spec in zip(kinds, meta["vehicles"], strict=True):

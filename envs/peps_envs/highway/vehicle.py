@@ -76,7 +76,9 @@ def not_zero(value: Array) -> Array:
 
 def wrap(angle: Array) -> Array:
     """`angle` in [-pi, pi)."""
-    return angle - 2 * math.pi * jnp.floor(angle / (2 * math.pi) + 0.5)
+    # a remainder is exact where a quotient's rounding hangs on how it is compiled: at -pi that would turn a car the other way
+    around = jnp.mod(angle + math.pi, 2 * math.pi) - math.pi
+    return jnp.where(jnp.abs(angle) < math.pi, angle, around)
 
 
 def closest_lane(x: Array, y: Array, lanes: int) -> Array:
@@ -105,7 +107,7 @@ def nearest_speed(speed: Array, grid: Array) -> Array:
 
 def decide(vehicles: Vehicles, action: Array, target_speeds: Array, lanes: int) -> Vehicles:
     """The ego's meta-action: it moves the target lane by one, or sets the target speed to a neighbour of the current speed."""
-    x, y, lane = vehicles.x[0], vehicles.y[0], vehicles.target_lane[0]
+    x, y, lane, action = vehicles.x[0], vehicles.y[0], vehicles.target_lane[0], jnp.asarray(action)
     sideways = (action == LANE_RIGHT).astype(jnp.int32) - (action == LANE_LEFT)
     candidate = jnp.clip(lane + sideways, 0, lanes - 1)
     lane = jnp.where(reachable(x, y, candidate), candidate, lane)

@@ -37,5 +37,10 @@ def domain(name: str) -> tuple[NavigationParams, dict[str, NavigationParams]]:
     """
     truth = DOMAINS[name]
     bias = DYNAMICS_BIAS[name]
-    beliefs = {"biased": bias, "unbiased": {}, "reward": REWARD_BIAS, "both": bias | REWARD_BIAS}
+    beliefs = {
+        "biased": bias,
+        "unbiased": {},
+        "reward": REWARD_BIAS,
+        "both": bias | REWARD_BIAS,
+    }
     return make_params(**truth), {belief: make_params(**(truth | told)) for belief, told in beliefs.items()}

@@ -2,20 +2,23 @@
 
     python -m peps_jax.reproduce.driving --seeds 10 --out results/study
 
-Bad input gets one line on stderr and exit code 2 before anything compiles; Ctrl-C ends with exit code 130.
+Bad input gets one line on stderr and exit code 2 before anything compiles; Ctrl-C ends with exit code 130,
+SIGTERM with 143.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import sys
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from peps_jax.command_line import Parser, options, refuse, use_every_core
+from peps_jax.command_line import Command, Parser, options
 from peps_jax.reproduce.driving import experiment, report
-from peps_jax.storage.files import NotWrittenError, check_writable
+from peps_jax.storage.files import check_writable
 from peps_jax.storage.ownership import Owner
 
 PROG = "python -m peps_jax.reproduce.driving"
@@ -46,10 +49,7 @@ class Request:
 
 def parser() -> Parser:
     """The command line's parser."""
-    made = Parser(
-        prog=PROG, usage=f"{PROG} [flags]", description=DESCRIPTION, allow_abbrev=False,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    made = Parser(PROG, description=DESCRIPTION)
     steps, lams = experiment.STEPS, experiment.LAMS
     made.add_argument("--out", default="results/study", metavar="DIR", help="folder to write [results/study]")
     made.add_argument("--overwrite", action="store_true", help="replace the study that the folder holds")
@@ -65,14 +65,8 @@ def parser() -> Parser:
     return made
 
 
-def request(arguments: Sequence[str]) -> Request:
-    """Reads and checks a command line.
-
-    Raises:
-      ValueError: a value makes no sense, or the folder holds another study.
-      SystemExit: a flag that doesn't exist or can't be read (code 2), or --help (code 0).
-    """
-    values = parser().parse(arguments)
+def request(values: argparse.Namespace) -> Request:
+    """What a command line asks for. Raises ValueError for a value that makes no sense, or if the folder holds another study."""
     if not 1 <= values.seeds <= MOST:
         raise ValueError(f"seeds {values.seeds} is out of range: choose 1 to {MOST}")
     last = 2**31 - values.seeds
@@ -90,28 +84,46 @@ def request(arguments: Sequence[str]) -> Request:
     return wanted
 
 
+class DrivingStudy:
+    """The study, run and written all at once."""
+
+    name, makes_checkpoints = "", False
+
+    def __init__(self, wanted: Request):
+        self._wanted = wanted
+        self._owner = Owner(wanted.out)
+
+    def begin(self) -> None:
+        """Takes the folder. Raises ValueError if it is another's or holds another study."""
+        self._owner.claim(self._wanted.check_free, over=self._wanted.overwrite)
+
+    def run(self, stop: threading.Event) -> int:
+        out = self._wanted.out
+        written = report.write(experiment.run(self._wanted.parts), out)
+        print((out / report.TABLE).read_text(encoding="utf-8"))
+        print(f"in {out}: {', '.join(path.name for path in written)}")
+        return 0
+
+    def kept(self) -> str:
+        return "nothing is written"
+
+    def writing(self) -> contextlib.AbstractContextManager[None]:
+        return self._owner.writing()
+
+    def close(self) -> None:
+        self._owner.release()
+
+
+def prepare(values: argparse.Namespace) -> DrivingStudy:
+    """The study that a command line asks for, with its folder."""
+    study = DrivingStudy(request(values))
+    study.begin()
+    return study
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code."""
-    use_every_core()
-    try:
-        wanted = request(sys.argv[1:] if arguments is None else arguments)
-        owner = Owner(wanted.out)
-        owner.claim(wanted.check_free, over=wanted.overwrite)
-    except (ValueError, NotWrittenError) as error:
-        return refuse(PROG, error)
-    try:
-        with owner.writing():
-            written = report.write(experiment.run(wanted.parts), wanted.out)
-    except KeyboardInterrupt:
-        print("\nstopped: nothing is written", file=sys.stderr)
-        return 130
-    except NotWrittenError as error:
-        return refuse(PROG, error)
-    finally:
-        owner.release()
-    print((wanted.out / report.TABLE).read_text())
-    print(f"in {wanted.out}: {', '.join(path.name for path in written)}")
-    return 0
+    return Command(PROG, lambda given: parser().parse(given), prepare).carry_out(arguments)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,103 @@
+"""The README's picture: what a human expects, what PEPS does and what SAC does in D4, side by side.
+
+    make film
+
+Trains both methods and the human's expectation with the default settings and one seed, and writes `docs/film.gif`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import peps_envs
+from peps_envs import Scene
+from peps_envs.navigation import NavigationState
+from peps_envs.scene import Polyline, Text
+from peps_jax import Config, Evaluation, evaluate, train
+from peps_jax.drawing.panels import colour_of
+from peps_jax.drawing.scenes import film, scenes_of
+
+ROOT = Path(__file__).parents[1]
+ENV = "nav-d4"
+TITLES = {"human_expectation": "what the human expects", "peps": "PEPS", "sac": "SAC"}
+NAMES = {"goal": "goal", "pit": "pit", "ice": "ice", "firm sand": "sand"}  # written on the areas of the first moment
+FRAMES_PER_STEP, RATE = 3, 9  # moments of a step, and of a second
+REST = 12  # moments that the end stands still
+WIDTH = 2.4  # inches, of one clip
+COLOURS = 64  # of the GIF's palette
+
+
+def labelled(scene: Scene) -> Scene:
+    """`scene` with the names of its areas on them, below the agent."""
+    *areas, agent = scene.shapes
+    names = [Text(area.x, area.y, NAMES[area.colour]) for area in areas if area.colour in NAMES]
+    return dataclasses.replace(scene, shapes=(*areas, *names, agent))
+
+
+def route_clip(method: str, evaluation: Evaluation) -> list[Scene]:
+    """The first episode of `evaluation`, moment by moment, with the way that was walked so far as a line."""
+    task = peps_envs.make(ENV)
+    steps = int(evaluation.length[0])
+    places = np.asarray(evaluation.perceived[0][: steps + 1])
+    states = NavigationState(places, jnp.arange(steps + 1))
+    times = np.arange(steps * FRAMES_PER_STEP + 1) / FRAMES_PER_STEP
+    clip, colour = [], colour_of(method)
+    for time, scene in zip(times, scenes_of(task.environment, task.params, states, times), strict=True):
+        *areas, agent = labelled(scene).shapes
+        way = [*map(tuple, places[: int(time) + 1]), (agent.x, agent.y)]
+        agent = dataclasses.replace(agent, colour=colour)
+        clip.append(dataclasses.replace(scene, shapes=(*areas, Polyline(tuple(way), colour), agent)))
+    return clip
+
+
+def clips(config: Config) -> dict[str, Sequence[Scene]]:
+    """A clip of each method by its title, which says how it scored."""
+    made = {}
+    for method, title in TITLES.items():
+        own = config.replace(method=method)
+        result = jax.jit(train)(own)
+        evaluation = evaluate(result, 1)
+        score = f"return {float(evaluation.return_[0]):.0f}, explicability {float(evaluation.explicability[0]):.0f}"
+        made[title if method == "human_expectation" else f"{title}: {score}"] = route_clip(method, evaluation)
+    return made
+
+
+def smaller(source: Path, target: Path) -> None:
+    """The GIF `source` without its white margin, and with one palette of `COLOURS` for all its pictures."""
+    from PIL import Image, ImageChops, ImageSequence
+
+    with Image.open(source) as whole:
+        pictures = [picture.convert("RGB") for picture in ImageSequence.Iterator(whole)]
+        times = [picture.info.get("duration", whole.info["duration"]) for picture in ImageSequence.Iterator(whole)]
+    white = Image.new("RGB", pictures[0].size, "white")
+    inside = ImageChops.difference(pictures[0], white).point(lambda part: 255 * (part > 8)).getbbox()
+    pictures = [picture.crop(inside) for picture in pictures]
+    palette = pictures[-1].quantize(COLOURS)
+    first, *rest = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    first.save(target, save_all=True, append_images=rest, duration=times, loop=0, optimize=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--steps", type=int, default=Config().total_steps, help="environment steps of a training")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "film.gif")
+    given = parser.parse_args(arguments)
+    made = clips(Config(env=ENV, seed=given.seed, total_steps=given.steps))
+    longest = max(map(len, made.values())) + REST
+    made = {title: [*clip, *[clip[-1]] * (longest - len(clip))] for title, clip in made.items()}
+    with tempfile.TemporaryDirectory() as folder:
+        film(made, Path(folder) / "film.gif", RATE, across=True, width=WIDTH)
+        smaller(Path(folder) / "film.gif", given.out)
+
+
+if __name__ == "__main__":
+    main()
