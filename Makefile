@@ -6,7 +6,7 @@ READY := .venv/ready
 ARGS ?=
 REPRODUCED ?= results/reproduce
 
-.PHONY: sweep reproduce test docs film verify-navigation benchmark readme publish lint lock setup
+.PHONY: sweep reproduce test docs film benchmark readme publish lint lock setup
 .DEFAULT_GOAL := sweep
 
 sweep: $(READY)
@@ -25,9 +25,6 @@ docs: $(READY)
 
 film: $(READY)
 	$(BIN)/python benchmarks/film.py $(ARGS)
-
-verify-navigation: $(READY)
-	$(BIN)/python benchmarks/verify_navigation.py $(ARGS)
 
 # beside other libraries, which it installs under benchmarks/.peers; ARGS="--quick" for a little of everything
 benchmark: $(READY)

@@ -75,7 +75,7 @@ def difference(scenario: dict[str, Any], name: str, recorded: dict[str, np.ndarr
     try:
         found = replay(scenario["meta"], scenario["actions"])
     except ValueError as error:
-        return f"refused: {str(error).split(': ')[0].split(' ', 2)[2].rsplit(' at ')[0]} too fast", 0.0
+        return "refused, because rounding decides" if "rounding" in str(error) else "refused: a plain car too fast", 0.0
     furthest = 0.0
     for key in ("state", "control", "target", "lane", "crashed", "timer", "impact", "obs", "reward", "terminated"):
         ours, theirs = np.asarray(found[key], float), np.asarray(recorded[f"{name}/{key}"], float)
@@ -101,7 +101,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     recorded = originals(scenes, given.python or str(peer.python_of("highway")))
     kinds, furthest, differing = collections.Counter(), 0.0, {}
     with jax.enable_x64(True):
-        for name, scenario in scenes.items():
+        for number, (name, scenario) in enumerate(scenes.items()):
+            if number % 20 == 0:
+                jax.clear_caches()  # hardly two scenes share a program
             kind, apart = difference(scenario, name, recorded)
             kinds[kind] += 1
             if kind == "equal":

@@ -144,7 +144,7 @@ def test_cars_intersect_where_one_covers_a_point_of_the_other(x, y, first, secon
     unit = lambda angle: (np.cos(angle), np.sin(angle))
     still = jnp.zeros(1)
     boxes = [tuple(jnp.asarray([value], jnp.float32) for value in pair) for pair in ((x, y), unit(first), unit(second))]
-    intersects, will_intersect, push_x, push_y = collision.meet(*boxes, (still, still))
+    intersects, will_intersect, push_x, push_y = collision.meet(*boxes, (still, still), 0.0)
     assert intersects == will_intersect  # nobody moves
 
     grid = np.stack(np.meshgrid(np.linspace(-2.5, 2.5, 81), np.linspace(-1, 1, 33)), -1).reshape(-1, 2)
@@ -158,7 +158,7 @@ def test_cars_intersect_where_one_covers_a_point_of_the_other(x, y, first, secon
         for share, expected in ((1.01, False), (0.9, True)):
             moved = (apart[0] - share * push_x, apart[1] - share * push_y)
             if np.hypot(push_x, push_y) > 0.05:
-                assert bool(collision.meet(moved, *boxes[1:], (still, still))[0][0]) == expected
+                assert bool(collision.meet(moved, *boxes[1:], (still, still), 0.0)[0][0]) == expected
 
 
 # Friction

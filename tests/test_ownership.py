@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+import types
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -19,9 +20,7 @@ import peps_envs
 import peps_jax
 from peps_jax.execution import batches, compilation_cache, program
 from peps_jax.reproduce import __main__ as reproduce
-from peps_jax.reproduce.driving import __main__ as driving
-from peps_jax.reproduce.driving import report
-from peps_jax.reproduce.store import Record, Store
+from peps_jax.reproduce.store import Store
 from peps_jax.storage import files
 from peps_jax.storage.ownership import OWNER, Owner, OwnershipLostError, owners
 from peps_jax.sweep import command, journal, meeting, pictures, results, underway, workers
@@ -472,7 +471,7 @@ def test_a_store_keeps_nothing_in_a_folder_that_it_has_lost(tmp_path, tiny):
     second.open()
     before = everything(tmp_path)
     with pytest.raises(OwnershipLostError):
-        first.save("cell", {}, Record({}, {}, np.zeros((3, 2, 2)), {}, failed=False, seconds=1.0))
+        first.save("cell", {}, {"routes": np.zeros((3, 2, 2))})
     with pytest.raises(OwnershipLostError), first.writing():
         files.write_whole(tmp_path / "table1.md", b"late")
     first.close()
@@ -497,7 +496,7 @@ def test_a_reproduction_that_comes_back_late_spoils_nothing(tmp_path, tiny, caps
         files.write_whole(folder / "table1.md", seeds)
         return [folder / "table1.md"]
 
-    table = reproduce.Result("", lambda made: [], write)
+    table = types.SimpleNamespace(ABOUT="", needs=lambda made: [], write=write)
     monkeypatch.setitem(reproduce.RESULTS, "table1", table)
     assert reproduce.main(["table1", "--seeds", "2", "--out", str(tmp_path)], tiny) == 2
     printed = capsys.readouterr()
@@ -506,29 +505,3 @@ def test_a_reproduction_that_comes_back_late_spoils_nothing(tmp_path, tiny, caps
     assert not printed.out
     assert everything(tmp_path) == after
     assert after["table1.md"] == b"3"
-
-
-def test_a_driving_study_that_comes_back_late_spoils_nothing(tmp_path, capsys, monkeypatch):
-    after = {}
-    arguments = ["--seeds", "1", "--out", str(tmp_path)]
-
-    def run(parts):
-        if not after:
-            after["begun"] = None
-            assert driving.main([*arguments]) == 2, "another one has begun, and nobody asked to overwrite it"
-            assert "belongs to another run" in capsys.readouterr().err
-            assert driving.main([*arguments, "--overwrite"]) == 0
-            after.update(everything(tmp_path))
-            capsys.readouterr()
-            return "late"
-        return "found"
-
-    monkeypatch.setattr(driving.experiment, "run", run)
-    pretend = lambda found, folder: files.write_whole(folder / report.TABLE, found.encode()) or [folder / report.TABLE]
-    monkeypatch.setattr(report, "write", pretend)
-    assert driving.main(arguments) == 2
-    printed = capsys.readouterr()
-    assert printed.err.startswith(f"{driving.PROG}: error: {LOST}")
-    assert printed.err.count("\n") == 1
-    del after["begun"]
-    assert everything(tmp_path) == after == {report.TABLE: b"found"}

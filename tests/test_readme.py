@@ -15,7 +15,6 @@ import pytest
 from jax import numpy as jnp
 
 import peps_jax.reproduce.__main__
-import peps_jax.reproduce.driving.__main__
 import peps_jax.sweep.arguments
 
 ROOT = Path(__file__).parents[1]
@@ -101,7 +100,6 @@ def test_the_readmes_environment_is_complete_in_25_lines_and_walks():
 PARSERS = {
     "peps_jax.sweep": peps_jax.sweep.arguments.parser,
     "peps_jax.reproduce": peps_jax.reproduce.__main__.parser,
-    "peps_jax.reproduce.driving": peps_jax.reproduce.driving.__main__.parser,
 }
 SCRIPTS = {"peps-sweep": "peps_jax.sweep", "peps-reproduce": "peps_jax.reproduce"}
 TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), flags=re.MULTILINE))

@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 from commands import exit_code, is_one_complaint
 
+import peps_envs
 from peps_jax import Config
 from peps_jax.analysis.intervals import Estimate
 from peps_jax.drawing import panels
 from peps_jax.execution import batches, program
 from peps_jax.reproduce import __main__ as command
-from peps_jax.reproduce import figures, store, tables, trainings
-from peps_jax.reproduce.driving import experiment, figure3
+from peps_jax.reproduce import figure1, figure3, frontier, plan, queries, store, summary, table1, ways
+from peps_jax.reproduce.driving import experiment
+from peps_jax.reproduce.plan import DOMAINS, METHODS, Plan
 from peps_jax.reproduce.store import Record, Store
-from peps_jax.reproduce.trainings import DOMAINS, METHODS, Study
-from peps_jax.storage.tables import markdown
+from peps_jax.storage.tables import latex, markdown
 
 EPISODES = 4
 
@@ -35,7 +36,7 @@ def no_training(monkeypatch):
         raise AssertionError("compiled")
 
     monkeypatch.setattr(program, "Program", refuse)
-    monkeypatch.setattr(trainings, "_plan_and_walk", refuse)
+    monkeypatch.setattr(plan, "_plan_and_walk", refuse)
 
 
 def made_up(value: float, failed: bool = False, horizon: int = 6) -> Record:
@@ -51,13 +52,14 @@ def made_up(value: float, failed: bool = False, horizon: int = 6) -> Record:
 
 def fill(folder, base, seeds: int) -> None:
     """A folder that has every training and plan, all made up."""
-    made, kept = Study(base, seeds, EPISODES), Store(folder, base, EPISODES, seeds)
+    made, kept = Plan(base, seeds, EPISODES), Store(folder, base, EPISODES, seeds)
     kept.open()
     for place, what in enumerate(every_need(made).values()):
-        kept.save(what.name, what.recipe, made_up(80 + place % 7, failed="drlhp-seed1" in what.name))
+        if not isinstance(what, experiment.Part):
+            kept.save(what.name, what.recipe, made_up(80 + place % 7, failed="drlhp-seed1" in what.name).arrays())
 
 
-def every_need(made: Study) -> dict:
+def every_need(made: Plan) -> dict:
     return {what.name: what for result in command.RESULTS.values() for what in result.needs(made)}
 
 
@@ -127,8 +129,8 @@ def test_a_record_comes_back_as_it_was(tmp_path, tiny):
     kept.open()
     record, recipe = made_up(3.0, failed=True), store.settings_of(tiny)
     assert kept.load("cell", recipe) is None
-    kept.save("cell", recipe, record)
-    again = kept.load("cell", recipe)
+    kept.save("cell", recipe, record.arrays())
+    again = Record.of(kept.load("cell", recipe))
     assert (again.failed, again.seconds) == (True, 1.0)
     np.testing.assert_array_equal(again.routes, record.routes)
     for part in ("mode", "sampled", "heat"):
@@ -143,7 +145,7 @@ def test_a_record_comes_back_as_it_was(tmp_path, tiny):
 def test_a_broken_file_is_said(content, tmp_path, tiny):
     kept = Store(tmp_path, tiny, EPISODES, seeds=2)
     kept.open()
-    (tmp_path / store.CELLS / "cell.npz").write_bytes(content)
+    (tmp_path / store.KEPT / "cell.npz").write_bytes(content)
     with pytest.raises(ValueError, match="can't be read: remove it"):
         kept.load("cell", {})
 
@@ -152,7 +154,7 @@ def test_a_broken_file_is_said(content, tmp_path, tiny):
 
 
 def test_a_change_that_changes_nothing_is_the_same_training(tiny):
-    made = Study(tiny, 3, EPISODES)
+    made = Plan(tiny, 3, EPISODES)
     plain = made.training("nav-d1", "peps", 2)
     assert plain.name == "nav-d1-peps-seed2"
     assert made.training("nav-d1", "peps", 2, lam=tiny.lam, num_queries=tiny.num_queries) == plain
@@ -163,7 +165,7 @@ def test_a_change_that_changes_nothing_is_the_same_training(tiny):
 
 
 def test_names_tell_recipes_apart(tiny):
-    made = Study(tiny, 3, EPISODES)
+    made = Plan(tiny, 3, EPISODES)
     by_name: dict[str, set[str]] = {}
     for result in command.RESULTS.values():
         for what in result.needs(made):
@@ -173,7 +175,7 @@ def test_names_tell_recipes_apart(tiny):
 
 
 def test_the_typical_training_is_the_median_one(tiny, monkeypatch):
-    made = Study(tiny, 4, EPISODES)
+    made = Plan(tiny, 4, EPISODES)
     trainings = made.trainings("nav-d1", "peps")
     values = dict(zip(trainings, (made_up(5.0), made_up(1.0), made_up(4.0), made_up(4.4, failed=True)), strict=True))
     monkeypatch.setattr(made, "record", values.__getitem__)
@@ -186,26 +188,31 @@ def test_the_typical_training_is_the_median_one(tiny, monkeypatch):
 
 def test_what_the_driving_study_trained_is_kept(tmp_path, tiny, capsys, monkeypatch):
     monkeypatch.setattr(experiment, "METHODS", ("sac",))
-    made, asked = Study(tiny, 2, EPISODES), []
-    part, over_lam = figure3._parts(made)
-    assert figure3._path(part, tmp_path) != figure3._path(over_lam, tmp_path)
+    made, asked = Plan(tiny, 2, EPISODES), []
+    part, over_lam = figure3.needs(made)
+    assert part.name != over_lam.name
     assert part.steps == tiny.total_steps, "the length that was asked for"
-    assert figure3._parts(Study(Config(), 2, EPISODES))[0].steps == experiment.STEPS
+    assert figure3.needs(Plan(Config(), 2, EPISODES))[0].steps == experiment.STEPS
 
-    def pretend(part):
+    def pretend(part, num_episodes):
         asked.append(part)
         like = jax.eval_shape(lambda config: experiment.learn(config, part.episodes), part.configs[0])
         return jax.tree.map(lambda leaf: np.full((1, 2, *leaf.shape), 3, leaf.dtype), like)
 
-    monkeypatch.setattr(experiment, "run_part", pretend)
-    first, again = figure3._make(part, tmp_path), figure3._make(part, tmp_path)
+    monkeypatch.setattr(experiment.Part, "make", pretend)
+    kept = Store(tmp_path, tiny, EPISODES, seeds=2)
+    kept.open()
+    made.make([part], kept)
+    again = Plan(tiny, 2, EPISODES)
+    assert again.missing([part], kept) == []
     assert asked == [part], "the second time from the file"
-    jax.tree.map(np.testing.assert_array_equal, first, again)
-    figure3.check(made, tmp_path)
-    with pytest.raises(ValueError, match="made with other settings or code"):
-        figure3.check(Study(tiny.replace(total_steps=320), 2, EPISODES), tmp_path)
+    jax.tree.map(np.testing.assert_array_equal, made.record(part), again.record(part))
+    monkeypatch.setattr(experiment, "SETTINGS", experiment.SETTINGS | {"gamma": 0.5})
+    with pytest.raises(ValueError, match="made with other settings"):
+        Plan(tiny, 2, EPISODES).missing([part], kept)
     Store(tmp_path / "other", tiny, EPISODES, seeds=2).open()
-    figure3._path(part, tmp_path / "other").write_bytes(b"PK half a file")
+    (tmp_path / "other" / store.KEPT / f"{part.name}.npz").write_bytes(b"PK half a file")
+    capsys.readouterr()
     assert call(["figure3", "--seeds", 2, "--out", tmp_path / "other"], tiny) == 2
     error = capsys.readouterr().err
     assert "can't be read: remove it" in error
@@ -216,16 +223,16 @@ def test_what_the_driving_study_trained_is_kept(tmp_path, tiny, capsys, monkeypa
 
 
 def test_numbers_in_a_table():
-    assert tables.with_interval(Estimate(1.04, -2.0, 3.96)) == "1.0 [-2.0, 4.0]"
-    assert tables.with_interval(Estimate(math.nan, math.nan, math.nan)) == "–"
-    assert tables.figure(None) == "–"
-    assert tables.figure(0.5, 2) == "0.50"
+    assert summary.with_interval(Estimate(1.04, -2.0, 3.96)) == "1.0 [-2.0, 4.0]"
+    assert summary.with_interval(Estimate(math.nan, math.nan, math.nan)) == "–"
+    assert summary.decimal(None) == "–"
+    assert summary.decimal(0.5, 2) == "0.50"
 
 
 def test_markdown_and_latex():
     head, rows = ["a", "b", "c"], [["x", "50 %", "1 ± 2"], ["x", "a_b", "–"], ["y", "r̂", "λ"]]
     assert markdown(head, rows).splitlines()[1:3] == ["|---|---|---|", "| x | 50 % | 1 ± 2 |"]
-    text = tables.latex(head, rows)
+    text = latex(head, rows)
     assert text.startswith("\\begin{tabular}{llr}\n\\toprule\na & b & c \\\\\n\\midrule\n")
     assert r"x & 50 \% & 1 $\pm$ 2 \\" in text
     assert text.count(r"\midrule") == 2, "one under the head, and one between x and y"
@@ -234,13 +241,13 @@ def test_markdown_and_latex():
 
 def test_a_line_of_known_scores():
     records = [made_up(value) for value in (0.0, 10.0, 20.0, 90.0)]
-    made = tables.line(["nav-d1"], "peps", [records], trained=5)
+    made = summary.line(["nav-d1"], "peps", [records], trained=5)
     assert (made["domain"], made["seeds"], made["failed"]) == ("nav-d1", 4, 1)
     assert made["return"] == 15.0, "the middle half"
     assert made["return_mean"] == 30.0
     assert made["return_low"] <= 15.0 <= made["return_high"]
     assert made["return_sd"] == pytest.approx(np.std([0, 10, 20, 90]))
-    everywhere = tables.line(DOMAINS, "peps", [records] * 3 + [records[:2]], trained=16)
+    everywhere = summary.line(DOMAINS, "peps", [records] * 3 + [records[:2]], trained=16)
     assert (everywhere["domain"], everywhere["failed"]) == ("all", 2)
     assert everywhere["explicability"] == 5.0, "as many seeds of each domain as the fewest"
 
@@ -249,11 +256,11 @@ def test_a_line_of_known_scores():
     ("values", "needed"), [([1.0, 2.0, 3.0], 100 * np.sqrt(10)), ([1.5, 0.0, 0.0], 100), ([0.0, 1.0, 1.4], np.inf)]
 )
 def test_the_queries_that_it_takes(values, needed):
-    assert figures.queries_needed([100, 1000, 10_000], values, 1.5) == pytest.approx(needed)
+    assert queries.queries_needed([100, 1000, 10_000], values, 1.5) == pytest.approx(needed)
 
 
 def test_one_seed_has_no_interval():
-    made = tables.line(["nav-d1"], "peps", [[made_up(1.0)]], trained=2)
+    made = summary.line(["nav-d1"], "peps", [[made_up(1.0)]], trained=2)
     assert math.isnan(made["return"])
     assert made["return_mean"] == 1.0
 
@@ -261,16 +268,31 @@ def test_one_seed_has_no_interval():
 def test_the_papers_numbers_say_what_the_paper_says():
     """Sec. 5.1: PEPS has the highest explicability everywhere, and its return is close to the best."""
     for place in range(len(DOMAINS)):
-        explicability = {method: values[place] for method, values in tables.PAPER["explicability"].items()}
-        returns = {method: values[place] for method, values in tables.PAPER["return"].items()}
+        explicability = {method: values[place] for method, values in table1.PAPER["explicability"].items()}
+        returns = {method: values[place] for method, values in table1.PAPER["return"].items()}
         assert max(explicability, key=explicability.get) == "peps"
         assert max(returns.values()) - returns["peps"] < 2
         assert all(explicability[method] <= returns[method] for method in returns), "l_H - l_A costs on average"
 
 
+def test_ways_have_the_names_of_figure_2():
+    x = np.linspace(0.5, 19.5, 200)
+    pit = {domain: np.asarray(peps_envs.make(domain).params.pit) for domain in ("nav-d1", "nav-d2")}
+    level = lambda y: np.stack([x, np.full_like(x, y)], 1)
+    over, under = pit["nav-d1"][3], pit["nav-d2"][1]
+    assert ways.way("nav-d1", level(over + 0.3), True) == "along the pit"
+    assert ways.way("nav-d1", level(over + 1.0), True) == "detour"
+    assert ways.way("nav-d2", level(under - 1.0), True) == "corridor"
+    assert ways.way("nav-d2", level(under + 1.0), True) == "below"
+    corner = np.array([[0.0, 0.0], [1.0, 4.0], [5.0, 5.0]])
+    assert ways.way("nav-d4", corner, True) == "sand"
+    assert ways.way("nav-d4", corner[:, ::-1], True) == "ice"
+    assert ways.way("nav-d4", corner, False) == "none"
+
+
 def test_points_at_one_place_share_a_label():
     places = np.array([[0.1, 0.1], [0.5, 0.1], [0.13, 0.08], [0.1, 0.5]])
-    assert figures._at_one_place(places) == [[0, 2], [1], [3]]
+    assert frontier._at_one_place(places) == [[0, 2], [1], [3]]
 
 
 # --- the whole ------------------------------------------------------------------------------------------------------------
@@ -278,13 +300,14 @@ def test_points_at_one_place_share_a_label():
 
 def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_training, monkeypatch):
     monkeypatch.setattr(panels, "DOTS", 30)
-    monkeypatch.setattr(figure3.experiment, "run", lambda parts, make: {part.method for part in parts})
+    monkeypatch.setattr(experiment.Part, "make", lambda part, num_episodes: made_up(1.0))
+    monkeypatch.setattr(experiment, "findings", lambda parts, seen: {part.method for part in parts})
     monkeypatch.setattr(figure3.report, "write", lambda found, folder: [folder / f"figure3 of {len(found)} methods"])
     fill(tmp_path, tiny, seeds=3)
     assert call(["all", "--seeds", 3, "--out", tmp_path], tiny) == 0
-    written = {path.name for path in tmp_path.iterdir()} - {store.HEAD, store.CELLS}
+    written = {path.name for path in tmp_path.iterdir()} - {store.HEAD, store.KEPT}
     pictures = ("figure1", "figure2", "frontier", "queries")
-    assert written == {"improvement.csv", "queries.md"} | {
+    assert written == {"improvement.csv", "queries.md", "frontier.md"} | {
         f"{name}.{kind}" for name in pictures for kind in ("png", "pdf", "csv")
     } | {f"{name}.{kind}" for name in ("table1", "ablations") for kind in ("md", "csv", "tex")}
     lines = lines_of(tmp_path / "table1.csv")
@@ -304,18 +327,18 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
 
 @pytest.mark.slow
 def test_a_stopped_table_continues(tmp_path, capsys, tiny, monkeypatch):
-    monkeypatch.setattr(trainings, "PLANNER", {name: dict(points=1, resolution=13) for name in trainings.PLANNER})
+    monkeypatch.setattr(plan, "PLANNER", {name: dict(points=1, resolution=13) for name in plan.PLANNER})
     monkeypatch.setattr(batches, "CELLS_PER_DEVICE", 1)  # two batches
-    for module in (tables, figures):
+    monkeypatch.setattr(table1, "METHODS", ("peps", "sac"))
+    monkeypatch.setattr(table1, "BASELINES", ("sac",))
+    for module in (table1, figure1):
         monkeypatch.setattr(module, "DOMAINS", ("nav-d1",))
-        monkeypatch.setattr(module, "METHODS", ("peps", "sac"))
-        monkeypatch.setattr(module, "BASELINES", ("sac",))
     seeds, compiled, asked = 4, batches.program, []
-    made, kept = Study(tiny, seeds, EPISODES), Store(tmp_path, tiny, EPISODES, seeds)
+    made, kept = Plan(tiny, seeds, EPISODES), Store(tmp_path, tiny, EPISODES, seeds)
     kept.open()
     plans = [made.planned("nav-d1", objective) for objective in ("peps", "human")]
     for what in [*plans, *made.trainings("nav-d1", "sac")]:  # one method and one plan are enough to compile
-        kept.save(what.name, what.recipe, made_up(80.0))
+        kept.save(what.name, what.recipe, made_up(80.0).arrays())
 
     def interrupt_the_last(cell, *arguments):
         asked.append(cell.method)
@@ -327,7 +350,7 @@ def test_a_stopped_table_continues(tmp_path, capsys, tiny, monkeypatch):
     arguments = ["table1", "--seeds", seeds, "--out", tmp_path]
     assert call(arguments, tiny) == 130
     assert "the same command continues" in capsys.readouterr().err
-    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / store.CELLS).iterdir()}
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / store.KEPT).iterdir()}
     assert len(kept) == 3 + seeds + 2, "plans, SAC, and a batch of PEPS"
     assert not (tmp_path / "table1.md").exists()
 

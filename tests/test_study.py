@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from commands import exit_code, is_one_complaint
 
 from peps_envs.highway.vehicle import FASTER, IDLE, LANE_LEFT, SLOWER
 from peps_envs.scene import Rectangle
 from peps_jax.drawing import scenes as pictures
 from peps_jax.preferences import data, teachers
-from peps_jax.reproduce.driving import __main__ as command
+from peps_jax.reproduce import __main__ as command
+from peps_jax.reproduce import store
 from peps_jax.reproduce.driving import comparisons, experiment, participants, ratings, report
 from peps_jax.reproduce.driving import scenes as road_scenes
 from peps_jax.train import train
@@ -212,40 +212,17 @@ def test_conduct_counts_seeds_and_leaves_out_who_failed():
     assert found.return_ == [6, 7]
 
 
-def test_the_studys_lambda_has_all_seeds_and_others_few():
+def test_its_own_lambda_has_all_seeds_and_others_few(monkeypatch):
     own, seeds = experiment.SETTINGS["lam"], range(3, 13)
-    peps, sac, sweep = experiment.parts(seeds, 80, lams=(0.0, own, 8.0), names=("peps", "sac"))
+    monkeypatch.setattr(experiment, "METHODS", ("peps", "sac"))
+    monkeypatch.setattr(experiment, "LAMS", (0.0, own, 8.0))
+    peps, sac, sweep = experiment.parts(seeds, 80)
     assert (peps.lams, sac.lams, sweep.lams) == ((own,), (own,), (0.0, 8.0))
     assert (peps.seeds, sweep.seeds) == (tuple(seeds), tuple(seeds[: experiment.FEW_SEEDS]))
     asked = [(float(config.lam), config.seed) for config in sweep.configs]
     assert asked == [(lam, seed) for lam in (0.0, 8.0) for seed in sweep.seeds]
-    assert len(experiment.parts(seeds, 80, lams=())) == len(experiment.METHODS)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "parts"),
-    [
-        ("--seeds 0", ("seeds 0", "choose 1 to")),
-        ("--seeds few", ("--seeds", "'few' is not a whole number")),
-        ("--seed -1", ("seed -1", "choose 0 to")),
-        ("--steps 0", ("total_steps 0", "from 1 to")),
-        ("--lams 1 -2", ("lams -2", "choose 0 or more")),
-        ("--lams nan", ("lams nan", "choose 0 or more")),
-        ("--lam 2", ("'--lam'", "did you mean --lams?")),
-    ],
-)
-def test_bad_input_is_one_line(arguments, parts, tmp_path, capsys):
-    assert exit_code(command.main, *arguments.split(), "--out", tmp_path / "out") == 2
-    assert is_one_complaint(capsys.readouterr(), command.PROG, parts)
-    assert not list(tmp_path.iterdir())
-
-
-def test_another_study_is_never_replaced_unasked(tmp_path, capsys, monkeypatch):
-    (tmp_path / report.TABLE).write_text("precious", encoding="utf-8")
-    assert command.main(["--out", str(tmp_path)]) == 2
-    assert "holds another study" in capsys.readouterr().err
-    assert (tmp_path / report.TABLE).read_text(encoding="utf-8") == "precious"
-    assert command.request(command.parser().parse(["--out", str(tmp_path), "--overwrite"])).out == tmp_path
+    monkeypatch.setattr(experiment, "LAMS", (own,))
+    assert len(experiment.parts(seeds, 80)) == 2
 
 
 @pytest.mark.slow
@@ -255,9 +232,12 @@ def test_a_small_study_from_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(experiment, "SETTINGS", experiment.SETTINGS | small)
     monkeypatch.setattr(experiment, "EPISODES", 8)
     monkeypatch.setattr(experiment, "METHODS", ("peps", "sac"))
-    monkeypatch.setattr(experiment, "run", functools.partial(experiment.run, number=3))
-    assert command.main(["--seeds", "1", "--steps", "80", "--lams", "2", "--out", str(tmp_path)]) == 0
-    assert {path.name for path in tmp_path.iterdir()} == set(command.FILES)
+    monkeypatch.setattr(experiment, "LAMS", ())
+    monkeypatch.setattr(experiment, "findings", functools.partial(experiment.findings, number=3))
+    arguments = ["figure3", "--seeds", "2", "--steps", "80", "--out", str(tmp_path)]
+    assert command.main(arguments) == 0
+    files = {report.TABLE, report.PICTURE, report.FILM, report.NUMBERS}
+    assert {path.name for path in tmp_path.iterdir()} == files | {store.HEAD, store.KEPT}
     numbers = json.loads((tmp_path / report.NUMBERS).read_text(encoding="utf-8"))
     assert set(numbers["ratings"]["mean"]) == {"peps", "sac"}
     assert [line["lam"] for line in numbers["over_lam"]] == [experiment.SETTINGS["lam"]]

@@ -2,9 +2,11 @@
 
 python -m peps_jax.reproduce table1 figure1 figure2 --out results/reproduce
 
-store    what is kept of each training, in files
-study    which trainings and plans there are, and how missing ones are made
-tables   Table 1 and the ablations
-figures  Figures 1 and 2, the frontier and the queries
-driving  Figure 3, the driving study
+plan     which trainings and planned routes there are, and how missing ones are made
+store    what is kept of each, in files
+summary  what the records of several trainings come to: estimates, a line of a table
+ways     names for the ways through the navigation domains
+driving  the driving study, of which Figure 3 tells
+
+Each result is a module with `needs` and `write`: table1, figure1, figure2, figure3, frontier, queries, ablations.
 """

@@ -13,20 +13,19 @@ import contextlib
 import dataclasses
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Protocol
 
 from peps_envs.registry import unknown_name
 from peps_jax.command_line import Command, Parser, called, options
 from peps_jax.config import Config
 from peps_jax.execution.waiting import Reminder
-from peps_jax.reproduce import figures, tables
-from peps_jax.reproduce.driving import figure3
+from peps_jax.reproduce import ablations, figure1, figure2, figure3, frontier, queries, table1
 from peps_jax.reproduce.driving.experiment import STEPS
-from peps_jax.reproduce.figures import QUERY_SEEDS
+from peps_jax.reproduce.plan import DOMAINS, FEW_SEEDS, METHODS, Need, Plan, Training
+from peps_jax.reproduce.queries import QUERY_SEEDS
 from peps_jax.reproduce.store import Store
-from peps_jax.reproduce.trainings import DOMAINS, FEW_SEEDS, METHODS, Planned, Study, Training
 
 PROG = called("peps_jax.reproduce", "peps-reproduce")
 MOST = 1000  # seeds
@@ -36,22 +35,26 @@ each with every seed, and the known-model planner beside them; and the driving s
 (figure3). Trainings are kept in the folder: a stopped command continues where it was, and results share them."""
 
 
-class Result(NamedTuple):
-    """Something to reproduce."""
+class Result(Protocol):
+    """Something to reproduce: a module of its own."""
 
-    text: str
-    needs: Callable[[Study], list[Training | Planned]]
-    write: Callable[[Study, Path], list[Path]]
+    ABOUT: str
+
+    def needs(self, plan: Plan) -> list[Need]:
+        """What has to be there before it is written."""
+
+    def write(self, plan: Plan, folder: Path) -> list[Path]:
+        """Writes its files from the records of what it needs; returns their paths."""
 
 
-RESULTS = {
-    "table1": Result("return and explicability of every method", tables.table1_needs, tables.table1),
-    "figure1": Result("the learned surrogate reward beside the true one", figures.figure1_needs, figures.figure1),
-    "figure2": Result("rollouts of every method", figures.figure2_needs, figures.figure2),
-    "figure3": Result("behaviours and ratings in the driving study", figure3.figure3_needs, figure3.figure3),
-    "frontier": Result("return and explicability over lambda", figures.frontier_needs, figures.frontier),
-    "queries": Result("explicability over the number of queries", figures.queries_needs, figures.queries),
-    "ablations": Result("PEPS and DRLHP without parts of them", tables.ablations_needs, tables.ablations),
+RESULTS: dict[str, Result] = {
+    "table1": table1,
+    "figure1": figure1,
+    "figure2": figure2,
+    "figure3": figure3,
+    "frontier": frontier,
+    "queries": queries,
+    "ablations": ablations,
 }
 GROUPS = {"paper": ("table1", "figure1", "figure2"), "all": tuple(RESULTS)}
 
@@ -61,13 +64,13 @@ class Request:
     """What a command line asks for, checked."""
 
     names: tuple[str, ...]  # of results
-    study: Study
+    plan: Plan
     store: Store
 
 
 def parser() -> Parser:
     """The command line's parser."""
-    texts = "\n".join(f"  {name:10} {result.text}" for name, result in RESULTS.items())
+    texts = "\n".join(f"  {name:10} {result.ABOUT}" for name, result in RESULTS.items())
     groups = "\n".join(f"  {name:10} {', '.join(members)}" for name, members in GROUPS.items())
     epilog = f"results:\n{texts}\n{groups}\n\nfrontier and ablations take the first {FEW_SEEDS} seeds, queries {QUERY_SEEDS}."
     made = Parser(PROG, "[RESULT ...] ", description=DESCRIPTION, epilog=epilog)
@@ -95,13 +98,11 @@ def request(values: argparse.Namespace, base: Config, num_episodes: int) -> Requ
     base.check()
     names = tuple(dict.fromkeys(each for name in values.results for each in GROUPS.get(name, (name,))))
     made = Request(
-        names, Study(base, values.seeds, num_episodes), Store(Path(values.out), base, num_episodes, values.seeds)
+        names, Plan(base, values.seeds, num_episodes), Store(Path(values.out), base, num_episodes, values.seeds)
     )
-    wanted = [what for name in names for what in RESULTS[name].needs(made.study)]
-    missing = made.study.missing(wanted, made.store)
-    made.study.batches([what for what in missing if isinstance(what, Training)][:1])  # to see, early, that one fits
-    if "figure3" in names:
-        figure3.check(made.study, made.store.folder)
+    wanted = [what for name in names for what in RESULTS[name].needs(made.plan)]
+    missing = made.plan.missing(wanted, made.store)
+    made.plan.batches([what for what in missing if isinstance(what, Training)][:1])  # to see, early, that one fits
     made.store.open()
     return made
 
@@ -118,16 +119,13 @@ class Reproduction:
         """Makes what is missing for each result, writes it, and shows the tables."""
         wanted, written = self._wanted, []
         for name in wanted.names:
-            needs = RESULTS[name].needs(wanted.study)
-            missing = wanted.study.missing(needs, wanted.store)
+            needs = RESULTS[name].needs(wanted.plan)
+            missing = wanted.plan.missing(needs, wanted.store)
             number = len({what.name for what in needs})
-            there = (
-                f"{number - len(missing)} of {number} trainings and plans are there" if number else "the driving study"
-            )
-            print(f"{name}: {there}", file=sys.stderr, flush=True)
-            wanted.study.make(missing, wanted.store)
+            print(f"{name}: {number - len(missing)} of {number} parts are there", file=sys.stderr, flush=True)
+            wanted.plan.make(missing, wanted.store)
             with Reminder(f"{name}: computing and drawing"):
-                written += RESULTS[name].write(wanted.study, wanted.store.folder)
+                written += RESULTS[name].write(wanted.plan, wanted.store.folder)
         for path in written:
             if path.suffix == ".md":
                 print(path.read_text(encoding="utf-8"))

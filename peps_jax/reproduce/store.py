@@ -1,7 +1,7 @@
-"""What is kept of each training and each plan: one file for each, whole or not there.
+"""What is kept of everything that takes long: one file for each, whole or not there.
 
     reproduce.json   what the folder is about: settings, code, seeds, versions, devices
-    cells/*.npz      a `Record` and the digest of what made it
+    kept/*.npz       what came out of a training or a plan, and the digest of what made it
 
 A folder holds one configuration. Another one's trainings, or those of other code, are never mixed with it or replaced.
 """
@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from peps_jax.analysis.surrogate_maps import rank_correlation
 from peps_jax.config import Config
 from peps_jax.evaluate import Evaluation
 from peps_jax.execution import machine
@@ -24,7 +25,7 @@ from peps_jax.storage import code, files
 from peps_jax.storage.arrays import read_arrays, write_arrays
 from peps_jax.storage.ownership import Owner, holds_nothing
 
-HEAD, CELLS = "reproduce.json", "cells"
+HEAD, KEPT = "reproduce.json", "kept"
 ROUTES = 3  # episodes of each training whose route is kept
 # modules whose code, and that of all they import, decides a record's numbers beside its settings
 CODE = ("peps_jax.train", "peps_jax.evaluate", "peps_jax.analysis.navigation_planner")
@@ -43,6 +44,27 @@ class Record(NamedTuple):
     def mean(self, name: str, sampled: bool = False) -> float:
         """Mean over episodes."""
         return float(np.mean((self.sampled if sampled else self.mode)[name]))
+
+    def rank_correlation(self) -> float:
+        """Of r-hat and the true l_H + r_H over the map."""
+        free = self.heat["free"]
+        return rank_correlation(self.heat["learned"][free], self.heat["true"][free])
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What a file holds of it."""
+        arrays = {"routes": self.routes, "failed": np.array(self.failed), "seconds": np.array(self.seconds)}
+        for part in ("mode", "sampled", "heat"):
+            arrays |= {f"{part}/{key}": values for key, values in getattr(self, part).items()}
+        return arrays
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, np.ndarray]) -> Record:
+        """What `arrays` were made of."""
+        part = lambda name: {
+            key.partition("/")[2]: value for key, value in arrays.items() if key.startswith(f"{name}/")
+        }
+        failed, seconds = bool(arrays["failed"]), float(arrays["seconds"])
+        return cls(part("mode"), part("sampled"), arrays["routes"], part("heat"), failed, seconds)
 
 
 def episodes(evaluation: Evaluation) -> dict[str, np.ndarray]:
@@ -102,7 +124,7 @@ class Store:
             if settings.get(setting) != value:
                 raise ValueError(f"{name} was made with {setting} {settings.get(setting)}, not {value}: {advice}")
         if code != self._code:
-            raise ValueError(f"{name} was made by other code (that of training, evaluation or worlds): {advice}")
+            raise ValueError(f"{name} was made by other code (that of training, evaluation or environments): {advice}")
         if seeds > self._head["seeds"]:
             raise ValueError(
                 f"{name} has tables of {seeds} seeds, more than {self._head['seeds']}: give --seeds {seeds} or more, or {advice}"
@@ -117,7 +139,7 @@ class Store:
         """
         self._owner.claim(self._check, over=True)
         with self.writing():
-            files.make_folder(self.folder / CELLS)
+            files.make_folder(self.folder / KEPT)
             files.write_whole(self.folder / HEAD, files.json_bytes(self._head | machine.describe()))
 
     def writing(self) -> AbstractContextManager[None]:
@@ -129,32 +151,22 @@ class Store:
         self._owner.release()
 
     def _path(self, name: str) -> Path:
-        return self.folder / CELLS / f"{name}.npz"
+        return self.folder / KEPT / f"{name}.npz"
 
     def digest(self, recipe: Mapping[str, Any]) -> str:
         """What tells the record of `recipe` from any other: settings, code, and number of episodes."""
         return digest(recipe, self._code, self._episodes)
 
-    def save(self, name: str, recipe: Mapping[str, Any], record: Record) -> None:
-        """Keeps a record. Raises OwnershipLostError if the folder isn't this run's any more."""
-        arrays = {"routes": record.routes, "failed": record.failed, "seconds": np.array(record.seconds)}
-        for part in ("mode", "sampled", "heat"):
-            arrays |= {f"{part}/{key}": values for key, values in getattr(record, part).items()}
+    def save(self, name: str, recipe: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+        """Keeps arrays by their names. Raises OwnershipLostError if the folder isn't this run's any more."""
         with self.writing():
             write_arrays(self._path(name), self.digest(recipe), arrays)
 
-    def load(self, name: str, recipe: Mapping[str, Any]) -> Record | None:
-        """The record called `name`, or None if there is none.
+    def load(self, name: str, recipe: Mapping[str, Any]) -> dict[str, np.ndarray] | None:
+        """The arrays kept as `name`, or None if there are none.
 
         Raises:
-          ValueError: it can't be read, or something other than `recipe` made it.
+          ValueError: they can't be read, or something other than `recipe` made them.
         """
         path = self._path(name)
-        if not path.exists():
-            return None
-        arrays = read_arrays(path, self.digest(recipe))
-        part = lambda name: {
-            key.partition("/")[2]: value for key, value in arrays.items() if key.startswith(f"{name}/")
-        }
-        failed, seconds = bool(arrays["failed"]), float(arrays["seconds"])
-        return Record(part("mode"), part("sampled"), arrays["routes"], part("heat"), failed, seconds)
+        return read_arrays(path, self.digest(recipe)) if path.exists() else None

@@ -19,7 +19,11 @@ def _distance(low_a: Array, high_a: Array, low_b: Array, high_b: Array) -> Array
 
 
 def meet(
-    offset: tuple[Array, Array], direction: tuple[Array, Array], other: tuple[Array, Array], shift: tuple[Array, Array]
+    offset: tuple[Array, Array],
+    direction: tuple[Array, Array],
+    other: tuple[Array, Array],
+    shift: tuple[Array, Array],
+    contact: Array,
 ) -> tuple[Array, Array, Array, Array]:
     """Whether two cars intersect, whether they will in this step, and the smallest translation that would part them.
 
@@ -28,6 +32,7 @@ def meet(
       direction: unit vector along the first car.
       other: unit vector along the other car.
       shift: how the first car moves relative to the other in the step, m.
+      contact: () m, the gap up to which they intersect.
 
     Returns:
       intersects, will intersect, translation of the first car along x and y.
@@ -48,9 +53,9 @@ def meet(
         centre = normal_x * offset[0] + normal_y * offset[1]
         moved = normal_x * shift[0] + normal_y * shift[1]
         low, high = centre - other_extent, centre + other_extent
-        intersects &= _distance(-extent, extent, low, high) <= 0
+        intersects &= _distance(-extent, extent, low, high) <= contact
         distance = _distance(-extent + jnp.minimum(moved, 0), extent + jnp.maximum(moved, 0), low, high)
-        will_intersect &= distance <= 0
+        will_intersect &= distance <= contact
         nearer = jnp.abs(distance) < smallest
         smallest = jnp.where(nearer, jnp.abs(distance), smallest)
         away = jnp.where(centre < 0, smallest, -smallest)
@@ -59,7 +64,7 @@ def meet(
     return intersects, will_intersect, push_x, push_y
 
 
-def collide(vehicles: Vehicles, dt: float) -> Vehicles:
+def collide(vehicles: Vehicles, dt: float, contact: Array) -> Vehicles:
     """Tests all pairs i < j. Who intersects has crashed; who will intersect is displaced in the next step, by half each."""
     number = vehicles.x.shape[0]
     none = vehicles.replace(
@@ -79,6 +84,7 @@ def collide(vehicles: Vehicles, dt: float) -> Vehicles:
         (ahead[first], aside[first]),
         (ahead[second], aside[second]),
         (move_x[first] - move_x[second], move_y[first] - move_y[second]),
+        contact,
     )
     intersects, will_intersect = intersects & near, will_intersect & near
 

@@ -13,9 +13,12 @@ import numpy as np
 from peps_envs.highway import classic, traffic, vehicle
 from peps_envs.highway.simulation import Physics, Road, advance, highway_env
 from peps_envs.highway.traffic import Drivers
-from peps_envs.highway.vehicle import LANE_WIDTH, Vehicles
+from peps_envs.highway.vehicle import LANE_WIDTH, Control, Vehicles
 
 KINDS = ("ego", "brake", "idm", "plain")
+GAP = 1e-9  # m, within which cars touch or don't: an earlier collision parts them to a gap of 0 up to rounding
+BLUR = 1e-12  # by which gains and habits are turned up and down, some ten thousand times what rounding does
+SPREAD = 1e-6  # by which the same scene may differ then: rounding alone makes a ten thousandth of it
 
 
 @partial(jax.jit, static_argnums=0)
@@ -89,6 +92,51 @@ def place(meta: Mapping[str, Any]) -> tuple[Vehicles, Drivers]:
     return jax.tree.map(jnp.asarray, (vehicles, drivers))
 
 
+def _drive(
+    road: Road, start: tuple[Vehicles, Drivers], actions: np.ndarray, physics: Physics
+) -> tuple[Vehicles, Control, dict[str, np.ndarray]]:
+    """What `actions` (P,) lead to: vehicles (S+1, N), controls (S, N), and the ego's obs, reward and terminated by policy steps."""
+    vehicles, drivers = start
+    traces, seen = [], {"obs": [classic.observe(vehicles, road.lanes)], "reward": [], "terminated": []}
+    for step, action in enumerate(actions):
+        vehicles, trace, observation, reward = _policy_step(road, vehicles, drivers, step, action, physics)
+        traces.append(trace)
+        for name, value in zip(seen, (observation, reward, vehicles.crashed[0]), strict=True):
+            seen[name].append(value)
+    moved, control = jax.tree.map(lambda *leaves: np.concatenate(leaves), *traces)
+    history = jax.tree.map(lambda first, later: np.concatenate([first[None], later]), start[0], moved)
+    return history, control, {name: np.stack(values) for name, values in seen.items()}
+
+
+def _state(history: Vehicles) -> np.ndarray:
+    """(S+1, N, 4): x, y, heading and speed."""
+    return np.stack([history.x, history.y, history.heading, history.speed], -1)
+
+
+def _check_decided(meta: Mapping[str, Any], road: Road, actions: np.ndarray) -> None:
+    """Raises ValueError where the last bits of a sum decide what happens: other programs, highway-env too, round them otherwise.
+
+    Cars that just touch, and a car that steers while it comes to a stand, make such scenes. They are driven twice in double
+    precision, once with wider contacts and gains turned up, once with narrower ones and gains turned down.
+    """
+    with jax.enable_x64(True):
+        start, states, crashed = place(meta), [], []
+        physics = highway_env(meta["target_speeds"])
+        for factor, contact in ((1 + BLUR, GAP), (1 - BLUR, -GAP)):
+            gains, habits = jax.tree.map(partial(jnp.multiply, factor), (physics.gains, physics.habits))
+            blurred = physics.replace(gains=gains, habits=habits, contact=jnp.asarray(contact))
+            history, *_ = _drive(road, start, actions, blurred)
+            states.append(_state(history))
+            crashed.append(history.crashed)
+    apart = (np.abs(states[0] - states[1]).max(-1) > SPREAD) | (crashed[0] != crashed[1])
+    if apart.any():
+        step, car = np.argwhere(apart)[0]
+        raise ValueError(
+            f"vehicle {car} is at {step / meta['sim_hz']:g} s where rounding decides what it does next, so that highway-env itself "
+            "would do otherwise on another machine; choose a shorter scene or another start"
+        )
+
+
 def replay(meta: Mapping[str, Any], actions: Sequence[int]) -> dict[str, np.ndarray]:
     """What happens in a scenario, in the precision that JAX is set to.
 
@@ -99,34 +147,29 @@ def replay(meta: Mapping[str, Any], actions: Sequence[int]) -> dict[str, np.ndar
     Returns:
       Arrays by the names of a recording, over S simulation steps of N vehicles: state (S+1, N, 4), control (S, N, 2),
       target (S+1, N, 2), lane, crashed and timer (S+1, N), impact (S+1, N, 2), obs (P+1, 5, 5), reward and terminated (P,).
+
+    Raises:
+      ValueError: a scenario that `place` refuses, or one in which rounding decides what happens.
     """
     road = Road(
         lanes=meta["lanes"], simulation_hz=meta["sim_hz"], policy_hz=meta["policy_hz"],
         follows=any(spec["kind"] == "idm" for spec in meta["vehicles"]),
     )  # fmt: skip
-    vehicles, drivers = start, _ = place(meta)
-    physics = highway_env(meta["target_speeds"])
-    traces, observations, rewards, terminated = [], [np.asarray(classic.observe(start, road.lanes))], [], []
-    for step, action in enumerate(np.asarray(actions)):
-        vehicles, trace, observation, reward = _policy_step(road, vehicles, drivers, step, action, physics)
-        traces.append(trace)
-        observations.append(observation)
-        rewards.append(reward)
-        terminated.append(vehicles.crashed[0])
-    moved, control = jax.tree.map(lambda *leaves: np.concatenate(leaves), *traces)
-    history = jax.tree.map(lambda first, later: np.concatenate([first[None], later]), start, moved)
+    actions = np.asarray(actions, np.int32)
+    start = place(meta)
+    _check_decided(meta, road, actions)
+    history, control, seen = _drive(road, start, actions, highway_env(meta["target_speeds"]))
+    drivers = start[1]
     steers = np.asarray(drivers.follows) | (np.arange(len(drivers.follows)) == 0)
     target = np.stack([history.target_lane, history.target_speed], -1)
     return {
-        "state": np.stack([history.x, history.y, history.heading, history.speed], -1),
+        "state": _state(history),
         "control": np.stack([np.asarray(vehicle.steering_angle(control.slip)), control.acceleration], -1),
         "target": np.where(steers[None, :, None], target, np.nan),
         "lane": np.asarray(vehicle.closest_lane(history.x, history.y, road.lanes)),
         "crashed": history.crashed,
         "timer": _timers(meta, history.wait),
         "impact": np.stack([history.impact_x, history.impact_y], -1),
-        "actions": np.asarray(actions, np.int32),
-        "obs": np.stack(observations),
-        "reward": np.stack(rewards),
-        "terminated": np.stack(terminated),
+        "actions": actions,
+        **seen,
     }

@@ -44,6 +44,7 @@ class Physics:
     friction: Friction
     gains: Gains
     habits: Habits
+    contact: Array  # m, the gap up to which cars collide: 0
     target_speeds: Array  # (m,) m/s, evenly spaced, among which FASTER and SLOWER choose
 
 
@@ -56,7 +57,7 @@ def highway_env(target_speeds: Sequence[float] = (20.0, 25.0, 30.0)) -> Physics:
             acceleration=3.0, deceleration=5.0, limit=6.0, distance=10.0, time_gap=1.5, exponent=4.0, least_gain=0.2,
             imposed_braking=2.0,
         ),
-        target_speeds=np.asarray(target_speeds),
+        contact=0.0, target_speeds=np.asarray(target_speeds),
     )  # fmt: skip
     return jax.tree.map(lambda value: jnp.asarray(value, jnp.result_type(float)), physics)
 
@@ -91,7 +92,7 @@ def simulate(
     is_ego = jnp.arange(number) == 0
     control = Control(jnp.where(is_ego, ego.slip, slip), jnp.where(is_ego, ego.acceleration, acceleration))
     control = vehicle.override(control, vehicles.speed, vehicles.crashed)
-    return collision.collide(vehicle.move(vehicles, control, road.dt), road.dt), control
+    return collision.collide(vehicle.move(vehicles, control, road.dt), road.dt, physics.contact), control
 
 
 def advance(

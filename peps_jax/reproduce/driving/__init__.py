@@ -1,7 +1,5 @@
 """The paper's driving study (Sec. 5.2) with synthetic participants: labels on a dry road, agents in the rain, ratings of them.
 
-    python -m peps_jax.reproduce.driving --seeds 10 --out results/study
-
 One group of participants compares pieces of scenes on a dry road, in none of which anybody crashes; a sanity check leaves out
 who prefers a collision. From their answers each method learns, and acts in the rain. Other participants then rate what was
 learned, from 1 to 10, by what they themselves believe and want. Nobody is told which method made a scene.

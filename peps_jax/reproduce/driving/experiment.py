@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +18,8 @@ from peps_jax.preferences.data import Segments
 from peps_jax.reproduce.driving.comparisons import compare
 from peps_jax.reproduce.driving.ratings import GROUPS, Group, groups
 from peps_jax.reproduce.driving.scenes import BEHAVIOURS, HORIZON, RAIN, behaviour, crashed, road, watch_agent
+from peps_jax.reproduce.store import settings_of
+from peps_jax.storage import code, files
 from peps_jax.train import train
 
 METHODS = ("peps", "sac", "drlhp", "policy_shaping")
@@ -48,6 +49,10 @@ class Seen(NamedTuple):
     crashed: Array  # (episodes,) bool
     return_: Array  # (episodes,) sum of r_A
     finite: Array  # () bool: what was learned is
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What a file holds of it: its leaves, numbered."""
+        return {str(place): np.asarray(leaf) for place, leaf in enumerate(jax.tree.leaves(self))}
 
 
 def learn(config: Config, episodes: int) -> Seen:
@@ -80,30 +85,49 @@ class Part(NamedTuple):
 
     @property
     def name(self) -> str:
-        return self.method if self.lams == (SETTINGS["lam"],) else f"{self.method} over lambda"
+        lams = "" if self.lams == (SETTINGS["lam"],) else "-over-lambda"
+        return f"driving-{self.method}{lams}-{len(self.seeds)}-seeds"
+
+    @property
+    def doing(self) -> str:
+        return f"training {len(self.configs)} agents, {self.name}"
 
     @property
     def configs(self) -> list[Config]:
         return [settings(self.method, seed, self.steps, lam=lam) for lam in self.lams for seed in self.seeds]
 
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """What decides its numbers: every setting, road and belief by their numbers, and the code."""
+        return {"agents": list(map(_recipe, self.configs)), "scenes": self.episodes, "code": code.digest(__name__)}
 
-def parts(
-    seeds: Sequence[int], steps: int = STEPS, lams: Iterable[float] = LAMS, names: Sequence[str] | None = None
-) -> list[Part]:
-    """What the study trains: methods `names`, all by default, and PEPS at the `lams` beside its own with fewer seeds."""
+    def of(self, arrays: Mapping[str, np.ndarray]) -> Seen:
+        """What a file's arrays were made of."""
+        like = jax.eval_shape(lambda config: learn(config, self.episodes), self.configs[0])
+        return jax.tree.unflatten(jax.tree.structure(like), [arrays[str(place)] for place in range(len(arrays))])
+
+    def make(self, num_episodes: int = 0) -> Seen:
+        """Trains and watches its agents over all devices: numpy arrays, (lams, seeds, ...)."""
+        del num_episodes  # the driving study has its own
+        program, cells = compile_over_devices(
+            lambda config: learn(config, self.episodes), list(map(shared, self.configs))
+        )
+        number, shape = len(self.configs), (len(self.lams), len(self.seeds))
+        shaped = lambda rows: np.asarray(rows)[:number].reshape(*shape, *rows.shape[1:])
+        return jax.tree.map(shaped, program(cells))
+
+
+def _recipe(config: Config) -> dict[str, Any]:
+    numbers = [np.asarray(leaf).tolist() for leaf in jax.tree.leaves((config.params, config.belief))]
+    return settings_of(config.replace(params=None, belief=None)) | {"numbers": files.plain(numbers)}
+
+
+def parts(seeds: Sequence[int], steps: int = STEPS) -> list[Part]:
+    """What is trained: each of `METHODS` with all seeds, and PEPS at the `LAMS` beside its own with fewer."""
     own = SETTINGS["lam"]
-    made = [Part(method, (own,), tuple(seeds), steps, EPISODES) for method in (METHODS if names is None else names)]
-    others = tuple(lam for lam in lams if lam != own)
+    made = [Part(method, (own,), tuple(seeds), steps, EPISODES) for method in METHODS]
+    others = tuple(lam for lam in LAMS if lam != own)
     return made + [Part("peps", others, tuple(seeds[:FEW_SEEDS]), steps, EPISODES)] * bool(others)
-
-
-def run_part(part: Part) -> Seen:
-    """Trains and watches its agents over all devices: numpy arrays, (lams, seeds, ...)."""
-    print(f"training {part.name}: {len(part.configs)} agents", file=sys.stderr, flush=True)
-    program, cells = compile_over_devices(lambda config: learn(config, part.episodes), list(map(shared, part.configs)))
-    number, shape = len(part.configs), (len(part.lams), len(part.seeds))
-    shaped = lambda rows: np.asarray(rows)[:number].reshape(*shape, *rows.shape[1:])
-    return jax.tree.map(shaped, program(cells))
 
 
 class Conduct(NamedTuple):
@@ -137,25 +161,20 @@ class Findings(NamedTuple):
     wider: list[Group]  # the same raters after they have seen every method; none if that is no more
 
 
-Make = Callable[[Part], Seen]  # trains a part's agents, or takes them from where they were kept
-
-
-def run(wanted: Sequence[Part], number: int = GROUPS, make: Make = run_part) -> Findings:
-    """The whole study: labels, agents, and `number` groups of raters."""
+def findings(parts: Sequence[Part], seen: Sequence[Seen], number: int = GROUPS) -> Findings:
+    """How the agents of `parts` behave, and how `number` groups of raters rate them."""
     scenes, conducts, over_lam = {}, {}, {}
-    for part in wanted:
-        seen = make(part)
+    for part, shown in zip(parts, seen, strict=True):
         for place, lam in enumerate(part.lams):
-            found = conduct(jax.tree.map(lambda rows: rows[place], seen))  # noqa: B023, used at once
+            found = conduct(jax.tree.map(lambda rows: rows[place], shown))  # noqa: B023, used at once
             if part.method == "peps":
                 over_lam[lam] = found
             if lam == SETTINGS["lam"]:
                 conducts[part.method] = found
-                good = np.flatnonzero(seen.finite[place])
+                good = np.flatnonzero(shown.finite[place])
                 pool = lambda rows: rows[place, good].reshape(-1, *rows.shape[3:])  # noqa: B023
-                scenes[part.method] = jax.tree.map(pool, seen.scenes)
-    print(f"{number} groups of raters", file=sys.stderr, flush=True)
-    key = jax.random.fold_in(jax.random.key(wanted[0].seeds[0]), 2)
+                scenes[part.method] = jax.tree.map(pool, shown.scenes)
+    key = jax.random.fold_in(jax.random.key(parts[0].seeds[0]), 2)
     papers = {method: shown for method, shown in scenes.items() if method in RATED}
     wider = groups(key, scenes, road(RAIN).problem(), number) if len(scenes) > len(papers) else []
     rated = groups(key, papers, road(RAIN).problem(), number)

@@ -14,13 +14,13 @@ from peps_jax.drawing import scenes as pictures
 from peps_jax.reproduce.driving.experiment import SETTINGS, Conduct, Findings
 from peps_jax.reproduce.driving.ratings import RATERS, Group
 from peps_jax.reproduce.driving.scenes import BEHAVIOURS, HORIZON, RAIN, typical
+from peps_jax.reproduce.summary import TITLES
 from peps_jax.storage import files
 from peps_jax.storage.tables import markdown
 
 MOMENTS = (1.0, 3.0, 5.0)  # s after the start, of the paper's Figure 3
 RATE = 6  # pictures of the film for a second of the scene
 PICTURE, FILM, NUMBERS, TABLE = "figure3.png", "figure3.gif", "figure3.json", "figure3.md"
-TITLES = {"peps": "PEPS", "sac": "SAC", "drlhp": "DRLHP", "policy_shaping": "policy shaping"}
 # Gong and Zhang 2021, Figure 3: mean and standard deviation of 15 ratings; p = 0.037
 PAPER = {"peps": (7.6, 2.4), "sac": (5.0, 2.3), "drlhp": (5.9, 2.2)}
 

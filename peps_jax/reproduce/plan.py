@@ -1,7 +1,7 @@
-"""Which trainings and plans an evaluation is made of, and how those that are missing are made.
+"""Which trainings and planned routes an evaluation is made of, and how those that are missing are made.
 
-A training is named for its world, its method, what it changes of the study's settings, and its seed: tables and figures that
-ask for the same one share it.
+A training is named for its environment, its method, what it changes of the plan's settings, and its seed: tables and figures
+that ask for the same one share it.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import functools
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import numpy as np
@@ -30,12 +30,37 @@ DOMAINS = ("nav-d1", "nav-d2", "nav-d3", "nav-d4")
 METHODS = ("peps", "sac", "drlhp", "policy_shaping", "human_expectation")  # Table 1's, and the human's expectation
 BASELINES = ("sac", "drlhp", "policy_shaping")
 FEW_SEEDS = 3  # of what is beside Table 1 and the figures of its trainings
-# of the planner, for each objective: noise acts in the believed world alone, and there a few points would miss its tails
+# of the planner, for each objective: noise acts in the believed dynamics alone, and there a few points would miss its tails
 PLANNER = {
     "return": dict(points=1, resolution=121),
     "peps": dict(points=1, resolution=121),
     "human": dict(points=7, resolution=61),
 }
+
+
+class Need(Protocol):
+    """Something that takes long, is made once, and is kept by its name."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """What decides its numbers, as JSON knows it."""
+
+    def of(self, arrays: Mapping[str, np.ndarray]) -> Any:
+        """What a file's arrays were made of: a record, which has `arrays()`."""
+
+
+class Alone(Need, Protocol):
+    """What is made by itself; trainings are made in batches."""
+
+    @property
+    def doing(self) -> str:
+        """What is going on while it is made."""
+
+    def make(self, num_episodes: int) -> Any:
+        """The record."""
 
 
 class Training(NamedTuple):
@@ -49,9 +74,12 @@ class Training(NamedTuple):
         """What decides its numbers."""
         return settings_of(self.config)
 
+    def of(self, arrays: Mapping[str, np.ndarray]) -> Record:
+        return Record.of(arrays)
+
 
 class Planned(NamedTuple):
-    """A plan of the known-model planner; lambda matters to "peps" alone."""
+    """A route of the known-model planner; lambda matters to "peps" alone."""
 
     env: str
     objective: str
@@ -67,19 +95,36 @@ class Planned(NamedTuple):
         """What decides its numbers."""
         return self._asdict() | PLANNER[self.objective]
 
+    @property
+    def doing(self) -> str:
+        return f"planning {self.name}"
+
+    def of(self, arrays: Mapping[str, np.ndarray]) -> Record:
+        return Record.of(arrays)
+
+    def make(self, num_episodes: int) -> Record:
+        """The route of the exact plan."""
+        start = time.perf_counter()
+        task = peps_envs.make(self.env)
+        belief = task.beliefs[task.default_belief]
+        asked = task.environment, task.params, belief, self.objective, self.lam, num_episodes
+        evaluation = jax.device_get(_plan_and_walk(*asked, gamma=self.gamma, **PLANNER[self.objective]))
+        routes = evaluation.perceived[:ROUTES]
+        return Record(episodes(evaluation), {}, routes, {}, failed=False, seconds=time.perf_counter() - start)
+
 
 Score = Callable[[Record], float]
 
 
-class Study:
+class Plan:
     """A base configuration, a number of seeds, and the records so far."""
 
     def __init__(self, base: Config, seeds: int, num_episodes: int):
         self.base, self.seeds, self.num_episodes = base, seeds, num_episodes
-        self._records: dict[str, Record] = {}
+        self._records: dict[str, Any] = {}
 
     def training(self, env: str, method: str, seed: int, **changes: Any) -> Training:
-        """The training of `method` in `env` with `changes` of the study's settings; changes that change nothing don't count."""
+        """The training of `method` in `env` with `changes` of the plan's settings; changes that change nothing don't count."""
         changes = {name: value for name, value in changes.items() if getattr(self.base, name) != value}
         told = "".join(f"-{name}-{value}" for name, value in changes.items())
         config = self.base.replace(env=env, method=method, seed=seed, **changes)
@@ -91,11 +136,12 @@ class Study:
         return [self.training(env, method, seed, **changes) for seed in range(number)]
 
     def planned(self, env: str, objective: str, lam: float | None = None) -> Planned:
-        """A plan, at the study's lambda by default."""
+        """A planned route, at the plan's lambda by default."""
         lam = self.base.lam if lam is None or objective != "peps" else lam
         return Planned(env, objective, float(lam), float(self.base.gamma))
 
-    def record(self, what: Training | Planned) -> Record:
+    def record(self, what: Need) -> Any:
+        """What came out of `what`: a `Record` of a training or a planned route."""
         return self._records[what.name]
 
     def records(self, trainings: Iterable[Training]) -> list[Record]:
@@ -108,7 +154,7 @@ class Study:
         middle = np.median([score(self.record(training)) for training in good]) if good else 0.0
         return min(good, key=lambda training: abs(score(self.record(training)) - middle), default=None)
 
-    def missing(self, wanted: Sequence[Training | Planned], store: Store) -> list[Training | Planned]:
+    def missing(self, wanted: Sequence[Need], store: Store) -> list[Need]:
         """Takes in what `store` has of `wanted`; returns the rest, each once.
 
         Raises:
@@ -119,11 +165,11 @@ class Study:
             if isinstance(what, Training):
                 check(what.config)
             if what.name not in self._records:
-                record = store.load(what.name, what.recipe)
-                if record is None:
+                arrays = store.load(what.name, what.recipe)
+                if arrays is None:
                     rest[what.name] = what
                 else:
-                    self._records[what.name] = record
+                    self._records[what.name] = what.of(arrays)
         return list(rest.values())
 
     def batches(self, trainings: Sequence[Training]) -> list[batches.Batch]:
@@ -131,17 +177,17 @@ class Study:
         configs = [training.config for training in trainings]
         return batches.plan(configs, self.num_episodes, most=batches.cells_soon_done(jax.devices()))
 
-    def make(self, missing: Sequence[Training | Planned], store: Store) -> None:
-        """Plans and trains what is missing; each batch is kept as soon as it is done."""
+    def make(self, missing: Sequence[Need], store: Store) -> None:
+        """Makes what is missing; each batch is kept as soon as it is done."""
 
-        def keep(what: Training | Planned, record: Record) -> None:
-            store.save(what.name, what.recipe, record)
+        def keep(what: Need, record: Any) -> None:
+            store.save(what.name, what.recipe, record.arrays())
             self._records[what.name] = record
 
-        plans = [what for what in missing if isinstance(what, Planned)]
-        for number, planned in enumerate(plans, 1):
-            print(f"planning {planned.name}, {number} of {len(plans)}", file=sys.stderr, flush=True)
-            keep(planned, _plan(planned, self.num_episodes))
+        alone = [what for what in missing if not isinstance(what, Training)]
+        for number, what in enumerate(alone, 1):
+            print(f"{what.doing}, {number} of {len(alone)}", file=sys.stderr, flush=True)
+            keep(what, what.make(self.num_episodes))
         trainings = [what for what in missing if isinstance(what, Training)]
 
         def keep_batch(done: batches.Batch, finished: Sequence[FinishedRun], times: Times) -> None:
@@ -176,16 +222,6 @@ def _reduce(cell: FinishedRun, num_episodes: int, seconds: float) -> Record:
 @functools.partial(jax.jit, static_argnums=1)
 def _evaluate_samples(result: Result, num_episodes: int) -> Evaluation:
     return evaluate(result, num_episodes, stochastic=True)
-
-
-def _plan(planned: Planned, num_episodes: int) -> Record:
-    start = time.perf_counter()
-    task = peps_envs.make(planned.env)
-    belief = task.beliefs[task.default_belief]
-    asked = task.environment, task.params, belief, planned.objective, planned.lam, num_episodes
-    evaluation = jax.device_get(_plan_and_walk(*asked, gamma=planned.gamma, **PLANNER[planned.objective]))
-    routes = evaluation.perceived[:ROUTES]
-    return Record(episodes(evaluation), {}, routes, {}, failed=False, seconds=time.perf_counter() - start)
 
 
 _plan_and_walk = jax.jit(

@@ -1,0 +1,56 @@
+"""The ablations: what Eq. (6) or the surrogate reward's fit is worth without parts of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from peps_jax.config import Config
+from peps_jax.reproduce.plan import DOMAINS, FEW_SEEDS, Need, Plan
+from peps_jax.reproduce.summary import cells, head, line, write_texts
+from peps_jax.storage.tables import csv_bytes, latex, markdown
+
+ABOUT = "PEPS and DRLHP without parts of them"
+
+
+def variants(base: Config) -> dict[str, tuple[str, dict[str, Any]]]:
+    """Methods, and what Eq. (6) or the surrogate reward's fit are left without, or get instead."""
+    return {
+        "PEPS": ("peps", {}),
+        "without environment entropy": ("peps", {"environment_entropy_weight": 0.0}),
+        "without policy entropy": ("peps", {"policy_entropy_weight": 0.0}),
+        "absolute entropies": ("peps", {"entropies": "absolute"}),
+        "r̂'s 0.95 quantile at 0": ("peps", {"level": "quantile"}),
+        "r̂'s maximum at 0": ("peps", {"level": "max"}),
+        "r̂'s mean at 0, deviation 1": ("peps", {"level": "standard"}),
+        "r̂'s level free: equal lengths": ("peps", {"min_segment_length": base.segment_length}),
+        "single network": ("peps", {"ensemble_size": 1}),
+        "DRLHP": ("drlhp", {}),
+        "DRLHP, normalised by its authors' way": ("drlhp", {"level": "standard"}),
+    }
+
+
+def needs(plan: Plan) -> list[Need]:
+    """Every variant in every domain, with few seeds."""
+    return [
+        training
+        for method, changes in variants(plan.base).values()
+        for domain in DOMAINS
+        for training in plan.trainings(domain, method, FEW_SEEDS, **changes)
+    ]
+
+
+def write(plan: Plan, folder: Path) -> list[Path]:
+    """ablations.{md,csv,tex}."""
+    lines, few = [], min(FEW_SEEDS, plan.seeds)
+    for domains in (*([domain] for domain in DOMAINS), DOMAINS):
+        for name, (method, changes) in variants(plan.base).items():
+            groups = [plan.records(plan.trainings(domain, method, FEW_SEEDS, **changes)) for domain in domains]
+            lines.append(line(domains, name, groups, few * len(domains)))
+    shown = [cells(made, paper=False) for made in lines]
+    contents = {
+        "ablations.md": markdown(head(paper=False), shown),
+        "ablations.csv": csv_bytes(lines),
+        "ablations.tex": latex(head(paper=False), shown),
+    }
+    return write_texts(folder, contents)

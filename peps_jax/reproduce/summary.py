@@ -1,0 +1,147 @@
+"""What the records of several trainings come to: estimates, a line of a table, and how both are written.
+
+Scores are means over a training's episodes, with the policy's mode unless "sampled" is said. A line's estimate is the
+interquartile mean over its seeds with a 95 % bootstrap interval; over all domains at once it is stratified, each domain
+resampled by itself. A training that failed is left out, and its line says how many there were.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from peps_jax.analysis.intervals import Estimate, estimate, interquartile_mean
+from peps_jax.drawing.panels import save
+from peps_jax.reproduce.store import Record
+from peps_jax.storage import files
+from peps_jax.storage.tables import csv_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SCORES = ("return", "explicability")
+TITLES = {
+    "peps": "PEPS", "sac": "SAC", "drlhp": "DRLHP", "policy_shaping": "policy shaping", "human_expectation": "human",
+}  # fmt: skip
+
+Line = dict[str, Any]  # a line of a CSV file
+
+
+def title(domain: str) -> str:
+    """A domain's name in a figure."""
+    return domain.removeprefix("nav-").upper()
+
+
+def explicability(record: Record) -> float:
+    """Mean over episodes."""
+    return record.mean("explicability")
+
+
+def mean(values: Sequence[float] | np.ndarray) -> float:
+    """nan where there is nothing."""
+    return float(np.mean(values)) if len(values) else math.nan
+
+
+def interval(*scores: Sequence[Sequence[float]], statistic: Any = interquartile_mean) -> Estimate:
+    """`statistic` of scores (tasks, runs), which may be fewer in some tasks; nan without two runs in each."""
+    fewest = [min(map(len, tasks), default=0) for tasks in scores]
+    if min(fewest) < 2:
+        return Estimate(math.nan, math.nan, math.nan)
+    runs = [np.array([task[:few] for task in tasks]).T for tasks, few in zip(scores, fewest, strict=True)]
+    return estimate(statistic, *runs)
+
+
+def estimates(records: Sequence[Record]) -> Line:
+    """Interquartile means of both scores over the seeds, with their intervals."""
+    made: Line = {"seeds": len(records)}
+    for score in SCORES:
+        found = interval([[record.mean(score) for record in records]])
+        made |= {score: found.value, f"{score}_low": found.low, f"{score}_high": found.high}
+    return made
+
+
+def line(domains: Sequence[str], what: str, groups: Sequence[Sequence[Record]], trained: int) -> Line:
+    """The numbers of one method or variant, from its records in each of `domains`; `trained` of them there were."""
+    good = [record for group in groups for record in group]
+    made: Line = {"domain": domains[0] if len(domains) == 1 else "all", "method": what}
+    made |= {"seeds": len(good) // len(domains), "failed": trained - len(good)}
+    for score in SCORES:
+        values = [[record.mean(score) for record in group] for group in groups]
+        found = interval(values)
+        made |= {score: found.value, f"{score}_low": found.low, f"{score}_high": found.high}
+        pooled = np.concatenate(values)
+        made |= {f"{score}_mean": mean(pooled), f"{score}_sd": float(np.std(pooled)) if pooled.size else math.nan}
+    arrived = [record.mean("goal_reached") for record in good]
+    made |= {"goal_rate": mean(arrived), "goal_rate_lowest": min(arrived, default=math.nan)}
+    made |= {f"sampled_{score}": mean([record.mean(score, sampled=True) for record in good]) for score in SCORES}
+    return made
+
+
+def decimal(value: float | None, digits: int = 1) -> str:
+    """A number in a table; a dash where there is none."""
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def with_interval(found: Estimate, digits: int = 1) -> str:
+    """A value and its interval."""
+    if not math.isfinite(found.value):
+        return "–"
+    return f"{decimal(found.value, digits)} [{decimal(found.low, digits)}, {decimal(found.high, digits)}]"
+
+
+def _estimate(made: Mapping[str, Any], score: str) -> str:
+    if score not in made:  # of the planner, which has no seeds
+        return decimal(made[f"{score}_mean"])
+    return with_interval(Estimate(made[score], made[f"{score}_low"], made[f"{score}_high"]))
+
+
+def cells(made: Mapping[str, Any], paper: bool) -> list[str]:
+    """A line as a table shows it."""
+    shown = [made["domain"], TITLES.get(made["method"], made["method"]), _seeds(made)]
+    for score in SCORES:
+        spread = f"{decimal(made[f'{score}_mean'])} ± {decimal(made[f'{score}_sd'])}" if f"{score}_sd" in made else ""
+        shown += [_estimate(made, score), spread] + [_paper(made, score)] * paper
+    shown.append(_goal(made))
+    sampled = [made.get(f"sampled_{score}") for score in SCORES]
+    return [*shown, "" if sampled[0] is None else " / ".join(map(decimal, sampled))]
+
+
+def _goal(made: Mapping[str, Any]) -> str:
+    """The share of episodes that reach the goal, and of the worst seed's where it differs."""
+    share, lowest = decimal(made.get("goal_rate"), 2), decimal(made.get("goal_rate_lowest"), 2)
+    return share if lowest in ("–", share) else f"{share} ({lowest})"
+
+
+def _seeds(made: Mapping[str, Any]) -> str:
+    if "seeds" not in made:
+        return ""
+    return f"{made['seeds']}" + f" ({made['failed']} failed)" * (made["failed"] > 0)
+
+
+def _paper(made: Mapping[str, Any], score: str) -> str:
+    value = made.get(f"{score}_paper")
+    return "" if value is None else f"{value:.2f}"
+
+
+def head(paper: bool) -> list[str]:
+    """The names of `cells`."""
+    names = ["domain", "method", "seeds"]
+    for score in SCORES:
+        names += [f"{score}, IQM [95 %]", "mean ± sd"] + ["paper"] * paper
+    return [*names, "goal (worst seed)", "sampled: return / explicability"]
+
+
+def write_texts(folder: Path, contents: Mapping[str, str | bytes]) -> list[Path]:
+    """Writes files by their names; returns their paths."""
+    for name, content in contents.items():
+        files.write_whole(folder / name, content.encode() if isinstance(content, str) else content)
+    return [folder / name for name in contents]
+
+
+def write_picture(picture: Figure, lines: Sequence[Line], folder: Path, name: str) -> list[Path]:
+    """Writes name.{csv,png,pdf}: a picture, and the numbers behind it."""
+    return [*write_texts(folder, {f"{name}.csv": csv_bytes(lines)}), *save(picture, folder, name, ("png", "pdf"))]

@@ -1,0 +1,144 @@
+"""Table 1: return and explicability of every method, beside the paper's and the planner's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from peps_jax.analysis.intervals import Estimate, probability_of_improvement
+from peps_jax.reproduce import ways
+from peps_jax.reproduce.plan import BASELINES, DOMAINS, METHODS, Need, Plan
+from peps_jax.reproduce.store import Record
+from peps_jax.reproduce.summary import (
+    SCORES,
+    TITLES,
+    Line,
+    cells,
+    decimal,
+    head,
+    interval,
+    line,
+    mean,
+    with_interval,
+    write_texts,
+)
+from peps_jax.storage.tables import csv_bytes, latex, markdown
+
+ABOUT = "return and explicability of every method"
+# Gong and Zhang 2021, Table 1, in the order of `DOMAINS`: averages over 100 rollouts, without intervals
+PAPER = {
+    "return": {
+        "peps": (95.53, 94.07, 96.80, 92.17),
+        "sac": (97.46, 95.65, 94.47, 93.27),
+        "drlhp": (74.51, 23.28, -50.76, 17.38),
+        "policy_shaping": (93.91, 95.55, -178.76, 90.11),
+    },
+    "explicability": {
+        "peps": (94.87, 91.10, 94.72, 92.17),
+        "sac": (92.57, 91.00, 91.88, 90.77),
+        "drlhp": (73.01, 20.94, -50.79, 17.36),
+        "policy_shaping": (89.17, 90.66, -181.46, 90.11),
+    },
+}
+_NOTE = """\
+IQM: interquartile mean over seeds, with a 95 % stratified bootstrap interval; {episodes} episodes a seed by the policy's mode,
+"sampled" by its samples. Way: how many seeds go as in the paper's Figure 2, and the way of the planner. Paper: Gong and Zhang
+2021, Table 1. The planner knows dynamics, belief and rewards; "peps" is Eq. (6) at λ = {lam:g}. "human" acts, and is scored, in
+the MDP that the human believes in.
+"""
+
+
+def needs(plan: Plan) -> list[Need]:
+    """All methods in all domains, and the planner's bounds."""
+    plans = [plan.planned(domain, objective) for domain in DOMAINS for objective in ("return", "peps", "human")]
+    return plans + [training for domain in DOMAINS for method in METHODS for training in plan.trainings(domain, method)]
+
+
+def write(plan: Plan, folder: Path) -> list[Path]:
+    """table1.{md,csv,tex}, and improvement.csv: how probably a training of PEPS scores higher than one of a baseline."""
+    groups = {method: [plan.records(plan.trainings(domain, method)) for domain in DOMAINS] for method in METHODS}
+    lines = []
+    for place, domain in enumerate(DOMAINS):
+        for method in METHODS:
+            made = line([domain], method, [groups[method][place]], plan.seeds)
+            if method in PAPER["return"]:
+                made |= {f"{score}_paper": PAPER[score][method][place] for score in SCORES}
+            if method in ways.PAPER:
+                made["way"] = _as_in_the_paper(domain, method, groups[method][place])
+            lines.append(made)
+        lines += [_planner_line(plan, domain, objective) for objective in ("return", "peps", "human")]
+    lines += [line(DOMAINS, method, groups[method], plan.seeds * len(DOMAINS)) for method in METHODS]
+    improvements = _improvements(groups)
+    names, shown = [*head(paper=True), "way"], [[*cells(made, paper=True), made.get("way", "")] for made in lines]
+    text = [
+        markdown(names, shown),
+        _NOTE.format(episodes=plan.num_episodes, lam=plan.base.lam),
+        "Probability that a training of PEPS scores higher than one of the baseline, with its 95 % interval:\n",
+        markdown(["domain", "baseline", *SCORES], [_improvement_cells(one) for one in improvements]),
+        "Share of the way from SAC's to the planner's explicability, and rank correlation of r̂ and ℓ_H + r_H over the map, means\n"
+        "over seeds:\n",
+        markdown(
+            ["domain", "planner − SAC", "PEPS covers", "rank correlation"],
+            [_covered(plan, domain) for domain in DOMAINS],
+        ),
+    ]
+    contents = {
+        "table1.md": "\n".join(text),
+        "table1.csv": csv_bytes(lines),
+        "table1.tex": latex(names, shown),
+        "improvement.csv": csv_bytes(improvements),
+    }
+    return write_texts(folder, contents)
+
+
+def _improvements(groups: Mapping[str, Sequence[Sequence[Record]]]) -> list[Line]:
+    """PEPS against each baseline, in each domain and over all."""
+    lines = []
+    for places, domain in (*(([place], domain) for place, domain in enumerate(DOMAINS)), (range(len(DOMAINS)), "all")):
+        for baseline in BASELINES:
+            made: Line = {"domain": domain, "baseline": baseline}
+            for score in SCORES:
+                ours, theirs = (
+                    [[record.mean(score) for record in groups[method][place]] for place in places]
+                    for method in ("peps", baseline)
+                )
+                found = interval(ours, theirs, statistic=probability_of_improvement)
+                made |= {score: found.value, f"{score}_low": found.low, f"{score}_high": found.high}
+            lines.append(made)
+    return lines
+
+
+def _improvement_cells(made: Mapping[str, Any]) -> list[str]:
+    shown = [Estimate(made[score], made[f"{score}_low"], made[f"{score}_high"]) for score in SCORES]
+    return [made["domain"], TITLES[made["baseline"]], *(with_interval(found, 2) for found in shown)]
+
+
+def _covered(plan: Plan, domain: str) -> list[str]:
+    best = plan.record(plan.planned(domain, "peps")).mean("explicability")
+    ours, base = (plan.records(plan.trainings(domain, method)) for method in ("peps", "sac"))
+    reached, from_where = (mean([record.mean("explicability") for record in records]) for records in (ours, base))
+    gap = best - from_where
+    share = (reached - from_where) / gap if gap > 0 else np.nan
+    agreement = mean([record.rank_correlation() for record in ours])
+    return [domain, decimal(gap), f"{share:.0%}" if np.isfinite(share) else "–", decimal(agreement, 2)]
+
+
+def _as_in_the_paper(domain: str, method: str, records: Sequence[Record]) -> str:
+    alike = sum(_way(domain, record) == ways.PAPER[method][domain] for record in records)
+    return f"{alike} of {len(records)}"
+
+
+def _way(domain: str, record: Record) -> str:
+    """That of its first episode."""
+    steps, arrived = int(record.mode["length"][0]), bool(record.mode["goal_reached"][0])
+    return ways.way(domain, record.routes[0][: steps + 1], arrived)
+
+
+def _planner_line(plan: Plan, domain: str, objective: str) -> Line:
+    record = plan.record(plan.planned(domain, objective))
+    means = {f"{score}_mean": record.mean(score) for score in SCORES}
+    told = {"goal_rate": record.mean("goal_reached"), "way": _way(domain, record)}
+    return {"domain": domain, "method": f"planner, {objective}"} | means | told
