@@ -18,7 +18,7 @@ from peps_jax.execution import machine, waiting
 from peps_jax.sweep import command, meeting
 from peps_jax.sweep.meeting import Place
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 # Bottom to top: rooms, and modules where a room has floors of its own. A module imports from the rows below its own, and from
 # its own row. What is named first counts: a module, then the room that it lies in.
@@ -102,7 +102,7 @@ def violations(root: Path) -> list[str]:
         if module == FRONT:
             continue
         if layer_of(module) is None:
-            lines.append(f"{module} has no layer: give it a place in LAYERS of tests/test_layers.py")
+            lines.append(f"{module} has no layer: give it a place in LAYERS of tests/project/test_layers.py")
             continue
         for target in sorted(imported(path, module, modules) - {module}):
             layer = layer_of(target)

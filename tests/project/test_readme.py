@@ -17,7 +17,7 @@ from jax import numpy as jnp
 import peps_jax.reproduce.__main__
 import peps_jax.sweep.arguments
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 PAGES = (README, ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")))
 EXECUTED = (
@@ -204,7 +204,7 @@ def test_code_and_tests_that_a_page_names_exist(page):
     names = set(re.findall(r"`((?:peps_jax|peps_envs)(?:\.\w+)+)[`(]", text))
     names |= set(re.findall(r"^::: (\S+)", text, flags=re.MULTILINE))
     assert not {name for name in names if not resolves(name)}
-    for file, test in re.findall(r"`(tests/\w+\.py)(?:::(\w+))?`", text):
+    for file, test in re.findall(r"`(tests/[\w/]+\.py)(?:::(\w+))?`", text):
         assert (ROOT / file).exists() or page.stem == "CONTRIBUTING", file
         assert f"def {test or ''}" in text_of(ROOT / file)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from test_layers import violations
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 SMALL = (
     "--seeds 1 --episodes 2 --total-steps 80 --num-envs 4 --rollout-length 20 --warmup-steps 0 --batch-size 16".split()
@@ -84,7 +84,7 @@ def run(root: Path, *command: object) -> subprocess.CompletedProcess:
 @pytest.mark.slow
 def test_the_tests_that_it_names_pass_with_what_was_added(checkout):
     wanted = {file for title in ("An environment", "A belief", "A method") for file in named(title) if "every" in file}
-    assert wanted == {"tests/test_every_environment.py", "tests/test_every_method.py"}
+    assert wanted == {"tests/environments/test_every_environment.py", "tests/methods/test_every_method.py"}
     done = run(checkout, "-m", "pytest", "-q", "--no-header", "-p", "no:cacheprovider", *sorted(wanted), "-k",
                "walk or timid or nav-d1")  # fmt: skip
     assert done.returncode == 0, done.stdout
