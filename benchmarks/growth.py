@@ -19,13 +19,13 @@ from peps_jax import Config, train
 from peps_jax.execution.program import stack
 
 ROUNDS = 8
-MOST = 8  # cells in a program: a sweep of many keeps what it has, batch by batch
+MOST = 8  # runs in a program: a sweep of many keeps what it has, batch by batch
 LARGEST = 64
 
 
-def seconds_of(config: Config, cells: int, repeats: int = 3) -> float:
+def seconds_of(config: Config, runs: int, repeats: int = 3) -> float:
     """Of training so many seeds at the same time."""
-    batched = timing.spread(stack(seeds_of(config, cells)))
+    batched = timing.spread(stack(seeds_of(config, runs)))
     program, _ = timing.compiled(train, batched)
     return timing.seconds(program, batched, repeats=repeats)
 
@@ -41,14 +41,14 @@ def seeds(config: Config, most: int, repeats: int) -> dict[str, float]:
         if filled not in programs:
             programs[filled], _ = timing.compiled(train, batched)
         calls = range(-(-size // inside))
-        in_batches = lambda cells, program=programs[filled], calls=calls: [program(cells) for _ in calls]
+        in_batches = lambda runs, program=programs[filled], calls=calls: [program(runs) for _ in calls]
         taken[str(size)] = timing.seconds(in_batches, batched, repeats=repeats)
         size *= 2
     return taken
 
 
 def seconds_a_step(config: Config, repeats: int) -> float:
-    """Of one environment step of one cell, on every device at the same time."""
+    """Of one environment step of one run, on every device at the same time."""
     return seconds_of(config, jax.device_count(), repeats) / steps_of(config)
 
 

@@ -22,6 +22,7 @@ import numpy as np
 import peer
 
 from peps_envs.highway.replay import replay
+from peps_jax.storage.tables import markdown
 
 ROOT = Path(__file__).parent
 OUT = ROOT / "results" / "highway_fuzz.md"
@@ -112,9 +113,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 differing[name] = scenario | {"what": kind, "apart": apart}
                 print(name, kind, apart, flush=True)
     lines = [f"{given.scenes} random scenes, seed {given.seed}: states and commands of the equal ones are at most",
-             f"{furthest:.1e} apart in every simulation step.", "", "| outcome | scenes |", "|---|---|",
-             *(f"| {kind} | {number} |" for kind, number in kinds.most_common())]  # fmt: skip
-    given.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+             f"{furthest:.1e} apart in every simulation step.", "",
+             markdown(["outcome", "scenes"], [[kind, str(number)] for kind, number in kinds.most_common()])]  # fmt: skip
+    given.out.write_text("\n".join(lines), encoding="utf-8")
     print("\n".join(lines))
     if differing:
         given.out.with_suffix(".json").write_text(json.dumps(differing, indent=1), encoding="utf-8")

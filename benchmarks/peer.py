@@ -110,7 +110,7 @@ def best(name: str, script: str, arguments: Sequence[object], quick: bool = Fals
 
 
 def _surroundings(name: str) -> dict[str, str]:
-    """The environment variables of a script: CPU only, our worlds importable, what JAX compiled kept for the next time."""
+    """The environment variables of a script: CPU only, our environments importable, what JAX compiled kept for the next time."""
     ours = {
         "JAX_PLATFORMS": "cpu",
         "PYTHONPATH": str(FOLDER.parent / "envs"),

@@ -13,11 +13,12 @@ import csv
 import dataclasses
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from peps_jax import Config
 from peps_jax.command_line import shown
+from peps_jax.storage.tables import markdown
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -65,7 +66,7 @@ def headline(file: str) -> str:
         ]
         for domain in domains
     ]
-    return table(head, body)
+    return markdown(head, body)
 
 
 def settings(_: str | None) -> str:
@@ -77,16 +78,10 @@ def settings(_: str | None) -> str:
         row = (f"`{field.name}`", default, kind, field.metadata["help"].replace("|", "\\|"))
         groups.setdefault(field.metadata["group"], []).append(row)
     head = ("field", "default", "kind", "what it is")
-    return "\n\n".join(f"### {name.capitalize()}\n\n{table(head, rows)}" for name, rows in groups.items())
+    return "\n\n".join(f"### {name.capitalize()}\n\n{markdown(head, rows).strip()}" for name, rows in groups.items())
 
 
 GENERATED: dict[str, Callable[[str | None], str]] = {"headline": headline, "settings": settings}
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 if __name__ == "__main__":

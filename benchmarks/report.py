@@ -7,13 +7,14 @@ from typing import Any
 
 from rounds import AT_ONCE, PARTS
 
+from peps_jax.storage.tables import markdown
 from peps_jax.train import VALUED_TOGETHER
 
 Record = dict[str, Any]
 AIMS = {  # of ratios within one run, and of seconds
     "fastest peer, 64": 3.0,
     "fastest peer, 256": 1.3,
-    "roof, 256": 0.8,
+    "roofline, 256": 0.8,
     "PEPS of SAC": 0.5,
     "linear": 0.1,
     "warm start": 3.0,
@@ -54,7 +55,7 @@ def ratios(record: Record) -> dict[str, float | None]:
     for width, rows in training["sac"].items():
         peer = fastest_peer(rows)
         made[f"fastest peer, {width}"] = rows["peps_jax"]["rate"] / peer[1] if peer else None
-        made[f"roof, {width}"] = rows["peps_jax"]["rate"] / record["roof"][width]["rate"]
+        made[f"roofline, {width}"] = rows["peps_jax"]["rate"] / record["roofline"][width]["rate"]
     made["PEPS of SAC"] = training["peps"]["64"]["rate"] / training["sac"]["64"]["peps_jax"]["rate"]
     made["linear"] = spread_of_seeds(record["growth"]["seeds"], devices)
     made["warm start"] = record["growth"]["compilation"]["warm"]
@@ -66,37 +67,37 @@ def ratios(record: Record) -> dict[str, float | None]:
 
 def text(record: Record) -> str:
     """The table, and what to know about it."""
-    return "\n".join([*_table(record), "", "![What was measured](speed.png)", "", *_sentences(record)]) + "\n"
+    return "\n".join([_table(record), "![What was measured](speed.png)", "", *_sentences(record)]) + "\n"
 
 
-def _table(record: Record) -> list[str]:
-    lines = [
-        "| measured | program | environment steps a second | peps_jax is so many times as fast | of the roof | compilation, s |",
-        "|---|---|---|---|---|---|",
-    ]
-    worlds = record["worlds"]
-    for name, row in worlds["rates"].items():
-        lines.append(_row(f"world {name}", "peps_jax", row))
-        for title, other in worlds["others"].items():
-            if other["world"] == name:
-                lines.append(_row(f"world {name}", title, other, row["rate"]))
-    for width, rows in record["training"]["sac"].items():
-        roof = record["roof"][width]["rate"]
-        for title, row in sorted(rows.items(), key=lambda item: -item[1].get("rate", 0.0)):
-            ours = None if title == "peps_jax" else rows["peps_jax"]["rate"]
-            lines.append(_row(f"SAC, {width} units", title, row, ours, roof))
+def _table(record: Record) -> str:
+    rows = []
+    environments = record["environments"]
+    for name, row in environments["rates"].items():
+        rows.append(_row(f"environment {name}", "peps_jax", row))
+        for title, other in environments["others"].items():
+            if other["environment"] == name:
+                rows.append(_row(f"environment {name}", title, other, row["rate"]))
+    for width, libraries in record["training"]["sac"].items():
+        roofline = record["roofline"][width]["rate"]
+        for title, row in sorted(libraries.items(), key=lambda item: -item[1].get("rate", 0.0)):
+            ours = None if title == "peps_jax" else libraries["peps_jax"]["rate"]
+            rows.append(_row(f"SAC, {width} units", title, row, ours, roofline))
     for width, row in record["training"]["peps"].items():
-        lines.append(_row(f"PEPS, {width} units", "peps_jax", row))
-    return lines
+        rows.append(_row(f"PEPS, {width} units", "peps_jax", row))
+    head = ["measured", "program", "environment steps a second", "peps_jax is so many times as fast", "of the roofline"]
+    return markdown([*head, "compilation, s"], rows)
 
 
-def _row(measured: str, program: str, row: Record, ours: float | None = None, roof: float | None = None) -> str:
+def _row(
+    measured: str, program: str, row: Record, ours: float | None = None, roofline: float | None = None
+) -> list[str]:
     if "missing" in row:
-        return f"| {measured} | {program} | not measured: {row['missing'].replace('|', ' ')} | | | |"
+        return [measured, program, f"not measured: {row['missing'].replace('|', ' ')}", "", "", ""]
     times = f"{ours / row['rate']:,.3g}" if ours else ""
-    share = f"{row['rate'] / roof:.0%}" if roof else ""
+    share = f"{row['rate'] / roofline:.0%}" if roofline else ""
     compilation = f"{row['compilation']:.1f}" if "compilation" in row else ""
-    return f"| {measured} | {program} | {row['rate']:,.0f} | {times} | {share} | {compilation} |"
+    return [measured, program, f"{row['rate']:,.0f}", times, share, compilation]
 
 
 def _sentences(record: Record) -> list[str]:
@@ -107,8 +108,8 @@ def _sentences(record: Record) -> list[str]:
         + ". Rates are summed over all that ran at the same time, and compilation is apart.",
         "",
         *(f"* {line}" for line in (
-            _aims(record), _worlds(record), _equal_work(training), _layouts(training), *_rounds(record["rounds"]),
-            _layers(record["layers"]), ALSO_TRIED, _roof(record), *_growth(record),
+            _aims(record), _environments(record), _equal_work(training), _layouts(training), *_rounds(record["rounds"]),
+            _layers(record["layers"]), ALSO_TRIED, _roofline(record), *_growth(record),
         )),
     ]  # fmt: skip
 
@@ -121,7 +122,7 @@ def _aims(record: Record) -> str:
     return (
         f"Aims, as ratios in this run: 3 times the fastest peer at 64 units: {said['fastest peer, 64']}"
         f"{_as_it_comes(record, '64')}; 1.3 times at 256: {said['fastest peer, 256']}{_as_it_comes(record, '256')}; "
-        f"0.8 of the roof at 256: {said['roof, 256']}; PEPS at 0.5 of SAC's rate: "
+        f"0.8 of the roofline at 256: {said['roofline, 256']}; PEPS at 0.5 of SAC's rate: "
         f"{said['PEPS of SAC']}; a seed's cost the same within 0.1: {said['linear']}; "
         f"a warm start within 3 s: {said['warm start']}.{_beyond(record)}"
     )
@@ -139,16 +140,16 @@ def _beyond(record: Record) -> str:
     told = []
     for width, rows in record["training"]["sac"].items():
         peer, aim = fastest_peer(rows), AIMS[f"fastest peer, {width}"]
-        share = aim * peer[1] / record["roof"][width]["rate"] if peer else 0.0
+        share = aim * peer[1] / record["roofline"][width]["rate"] if peer else 0.0
         if share > 1:
-            told.append(f" At {width}, {aim:g} times the fastest peer would be {share:.0%} of the roof.")
+            told.append(f" At {width}, {aim:g} times the fastest peer would be {share:.0%} of the roofline.")
     return "".join(told)
 
 
-def _worlds(record: Record) -> str:
-    difference = record["worlds"].get("difference")
-    check = f"; 500 of its steps are the JAX world's within {difference:.0e}" if difference is not None else ""
-    return f"Worlds: random actions, a new start after an episode. NumPy's D1 has nothing of the other domains{check}."
+def _environments(record: Record) -> str:
+    difference = record["environments"].get("difference")
+    check = f"; 500 of its steps are the JAX environment's within {difference:.0e}" if difference is not None else ""
+    return f"Environments: random actions, a new start after an episode. NumPy's D1 has nothing of the other domains{check}."
 
 
 def _equal_work(training: Record) -> str:
@@ -159,7 +160,7 @@ def _equal_work(training: Record) -> str:
         "SAC: D1, 16 environments, an update for every 4 steps, batches of 256, two layers, twin critics, Adam at 1e-3. Ours are "
         "2 trainings on each core. A peer has all cores, as one process or as a training on each, whichever is faster "
         f"(at 64: {', '.join(ways)}). Stable-Baselines3 and SBX step D1 in one NumPy array for all 16, Brax "
-        "and rejax step the JAX world; evaluations are left out."
+        "and rejax step the JAX environment; evaluations are left out."
     )
 
 
@@ -168,7 +169,7 @@ def _layouts(training: Record) -> str:
     for width, layouts in training["layouts"].items():
         ours = training["sac"][width]["peps_jax"]["rate"]
         parts += [f"{name} {rate / ours:.0%} at {width}" for name, rate in layouts.items()]
-    return f"Tried: cells one after the other on each core (taken); {', '.join(parts)} of its rate."
+    return f"Tried: runs one after the other on each core (taken); {', '.join(parts)} of its rate."
 
 
 def _rounds(rounds: Record) -> list[str]:
@@ -205,19 +206,20 @@ def _layers(layers: Record) -> str:
     )
 
 
-def _roof(record: Record) -> str:
+def _roofline(record: Record) -> str:
     parts = []
-    for width, roof in record["roof"].items():
+    for width, roofline in record["roofline"].items():
         rate, rounds = record["training"]["sac"][width]["peps_jax"]["rate"], record["rounds"][f"sac {width}"]
         updates = min(rounds["improve"] / rounds["whole"], 1.0)  # timed apart, it may come out longer than the whole
         outside = 1 - updates
-        share = rate / roof["rate"]
+        share = rate / roofline["rate"]
         parts.append(
-            f"at {width} an update is {roof['multiply_adds'] / 1e6:.1f} million multiply-adds, which this machine makes at "
-            f"{roof['multiply_adds_per_second'] / 1e9:.0f} billion a second where it does nothing else; SAC reaches {share:.0%} of "
-            f"that ({outside:.0%} of its time is outside the updates, {max(updates - share, 0):.0%} is in them but not in products)"
+            f"at {width} an update is {roofline['multiply_adds'] / 1e6:.1f} million multiply-adds, which this machine makes at "
+            f"{roofline['multiply_adds_per_second'] / 1e9:.0f} billion a second where it does nothing else; SAC reaches "
+            f"{share:.0%} of that ({outside:.0%} of its time is outside the updates, {max(updates - share, 0):.0%} is in them but "
+            "not in products)"
         )
-    return f"Roof: the products of an update's shapes alone, on as many devices at once; {'; '.join(parts)}."
+    return f"Roofline: the products of an update's shapes alone, on as many devices at once; {'; '.join(parts)}."
 
 
 def _growth(record: Record) -> list[str]:
@@ -241,14 +243,14 @@ def _growth(record: Record) -> list[str]:
 
 
 def draw(record: Record, path: pathlib.Path) -> None:
-    """Worlds, SAC beside others and the roof, PEPS's round, and cost as work grows."""
+    """Environments, SAC beside others and the roofline, PEPS's round, and cost as work grows."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13.0, 8.0), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     panels = figure.subplots(2, 2)
-    _draw_worlds(panels[0, 0], record["worlds"])
+    _draw_environments(panels[0, 0], record["environments"])
     _draw_sac(panels[0, 1], record)
     _draw_rounds(panels[1, 0], record["rounds"])
     _draw_growth(panels[1, 1], record["growth"])
@@ -269,11 +271,11 @@ def _bars(panel: Any, names: list[str], rates: list[float | None], colours: list
     panel.set_xlim(least, max(filter(None, rates)) * 6)
 
 
-def _draw_worlds(panel: Any, worlds: Record) -> None:
-    rows = [(f"{name}, peps_jax", row.get("rate"), COLOURS[0]) for name, row in worlds["rates"].items()]
-    rows += [(f"{row['world']}, {name}", row.get("rate"), QUIET) for name, row in worlds["others"].items()]
+def _draw_environments(panel: Any, environments: Record) -> None:
+    rows = [(f"{name}, peps_jax", row.get("rate"), COLOURS[0]) for name, row in environments["rates"].items()]
+    rows += [(f"{row['environment']}, {name}", row.get("rate"), QUIET) for name, row in environments["others"].items()]
     _bars(panel, *map(list, zip(*rows, strict=True)))
-    panel.set_title("Worlds alone: steps a second on all cores")
+    panel.set_title("Environments alone: steps a second on all cores")
 
 
 def _draw_sac(panel: Any, record: Record) -> None:
@@ -281,7 +283,7 @@ def _draw_sac(panel: Any, record: Record) -> None:
     for width, libraries in training["sac"].items():
         for name, row in sorted(libraries.items(), key=lambda item: -item[1].get("rate", 0.0)):
             rows.append((f"SAC {width}, {name}", row.get("rate"), COLOURS[0] if name == "peps_jax" else QUIET))
-        rows.append((f"SAC {width}, products alone", record["roof"][width]["rate"], COLOURS[1]))
+        rows.append((f"SAC {width}, products alone", record["roofline"][width]["rate"], COLOURS[1]))
     rows += [(f"PEPS {width}, peps_jax", row["rate"], COLOURS[4]) for width, row in training["peps"].items()]
     _bars(panel, *map(list, zip(*rows, strict=True)))
     panel.set_title("Training: steps a second on all cores")

@@ -109,14 +109,14 @@ def parts(structure: Config) -> dict[str, Callable[[Prepared, Config], Any]]:
 
 
 def seconds_of_parts(config: Config, repeats: int) -> dict[str, float]:
-    """Seconds of each part of one cell's round, while all devices do the same."""
-    each = 4  # cells on a device, so that what a call costs is little of it
-    cells = timing.spread(stack(seeds_of(config, each * jax.device_count())))
-    prepared = timing.compiled(prepare, cells)[0](cells)
+    """Seconds of each part of one run's round, while all devices do the same."""
+    each = 4  # runs on a device, so that what a call costs is little of it
+    runs = timing.spread(stack(seeds_of(config, each * jax.device_count())))
+    prepared = timing.compiled(prepare, runs)[0](runs)
     taken = {}
     for name, part in parts(config).items():
-        program, _ = timing.compiled(part, prepared, cells)
-        taken[name] = timing.seconds(program, prepared, cells, repeats=repeats) / each
+        program, _ = timing.compiled(part, prepared, runs)
+        taken[name] = timing.seconds(program, prepared, runs, repeats=repeats) / each
     return taken
 
 

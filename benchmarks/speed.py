@@ -2,10 +2,10 @@
 
     make benchmark [ARGS="--quick"]
 
-Worlds alone (`worlds`), SAC beside other libraries and PEPS (`training`), the parts of a round (`rounds`), matrix products
-alone (`roof`) and as networks make them (`layers`), and what more work costs (`growth`), in one run, so that ratios mean
-something. Other libraries are installed on the first call (`peer`); one that can't be is a row that says so. `--quick` runs a
-little of everything, into build/benchmark.
+Environments alone (`environments`), SAC beside other libraries and PEPS (`training`), the parts of a round (`rounds`), matrix
+products alone (`roofline`) and as networks make them (`layers`), and what more work costs (`growth`), in one run, so that ratios
+mean something. Other libraries are installed on the first call (`peer`); one that can't be is a row that says so. `--quick` runs
+a little of everything, into build/benchmark.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import jax
 from peps_jax.command_line import print_whatever_can_be_shown, use_every_core
 
 FOLDER = pathlib.Path(__file__).parent
-SECTIONS = ("worlds", "training", "roof", "rounds", "layers", "growth")
+SECTIONS = ("environments", "training", "roofline", "rounds", "layers", "growth")
 
 
 def processor() -> str:

@@ -46,10 +46,10 @@ def steps_of(config: Config) -> int:
 def cost(
     configs: list[Config], devices: int | None = None, together: bool = False, repeats: int = 3
 ) -> dict[str, float]:
-    """Trains all `configs`, of one structure: environment steps a second, summed over cells."""
-    cells = timing.spread(stack(configs), devices)
-    program, compilation = timing.compiled(train, cells, devices=devices, together=together)
-    seconds = timing.seconds(program, cells, repeats=repeats)
+    """Trains all `configs`, of one structure: environment steps a second, summed over runs."""
+    runs = timing.spread(stack(configs), devices)
+    program, compilation = timing.compiled(train, runs, devices=devices, together=together)
+    seconds = timing.seconds(program, runs, repeats=repeats)
     return {"rate": sum(map(steps_of, configs)) / seconds, "seconds": seconds, "compilation": compilation}
 
 
@@ -57,10 +57,10 @@ def seeds_of(config: Config, number: int) -> list[Config]:
     return [config.replace(seed=seed) for seed in range(number)]
 
 
-def ours(method: str, width: int, steps: int, cells: int, **layout: Any) -> dict[str, float]:
-    """`cells` trainings of D1, at the package's defaults but for their length and width."""
+def ours(method: str, width: int, steps: int, runs: int, **layout: Any) -> dict[str, float]:
+    """`runs` trainings of D1, at the package's defaults but for their length and width."""
     config = Config(env="nav-d1", method=method, hidden_sizes=(width, width))
-    return cost(seeds_of(shortened(config, steps), cells), **layout)
+    return cost(seeds_of(shortened(config, steps), runs), **layout)
 
 
 def theirs(library: Library, width: int, steps: int, quick: bool) -> dict[str, Any]:
@@ -75,15 +75,15 @@ def theirs(library: Library, width: int, steps: int, quick: bool) -> dict[str, A
 def measure(quick: bool) -> dict[str, Any]:
     """SAC at each width, and PEPS: ours, then the peers' on the same cores."""
     record: dict[str, Any] = {"sac": {}, "peps": {}, "layouts": {}}
-    cells = 2 * jax.device_count()
+    runs = 2 * jax.device_count()
     for place, width in enumerate(WIDTHS):
         steps = 800 if quick else (12_000, 3_200)[place]
-        rows = record["sac"][str(width)] = {"peps_jax": ours("sac", width, steps, cells)}
+        rows = record["sac"][str(width)] = {"peps_jax": ours("sac", width, steps, runs)}
         record["layouts"][str(width)] = {
-            "side by side on each core": ours("sac", width, steps, cells, together=True, repeats=1)["rate"],
-            "all cores for each training": ours("sac", width, steps, cells, devices=1, repeats=1)["rate"],
+            "side by side on each core": ours("sac", width, steps, runs, together=True, repeats=1)["rate"],
+            "all cores for each training": ours("sac", width, steps, runs, devices=1, repeats=1)["rate"],
         }
         for library in LIBRARIES:
             rows[library.title] = theirs(library, width, QUICK_STEPS if quick else library.steps[place], quick)
-    record["peps"]["64"] = ours("peps", 64, 800 if quick else 12_000, cells)
+    record["peps"]["64"] = ours("peps", 64, 800 if quick else 12_000, runs)
     return record

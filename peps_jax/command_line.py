@@ -1,7 +1,7 @@
 """What the command lines share: how they are called, begin and end, flags made of settings, complaints of one line.
 
     0    all is done
-    1    part of the work failed: cells, or another process
+    1    part of the work failed: runs, or another process
     2    bad input, devices or processes that aren't there, a folder that can't be written or is another run's now
     130  Ctrl-C
     143  SIGTERM

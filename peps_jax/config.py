@@ -27,7 +27,7 @@ from peps_jax.fields import (
     SHARE,
     SIZES,
     SWITCH,
-    Right,
+    Range,
     check_single,
     check_value,
     shown,
@@ -140,7 +140,7 @@ class Config:
     )
     candidates_per_query: int = static(
         10,
-        Right(lambda value: COUNT.holds(value) & (value >= 10), "10 or more, or the choice is no choice"),
+        Range(lambda value: COUNT.holds(value) & (value >= 10), "10 or more, or the choice is no choice"),
         "candidate pairs for each query asked",
         group="queries",
     )
@@ -250,7 +250,7 @@ def _kind(tree: Any) -> str:
 def grid(config: Config, **leaves: Any) -> Config:
     """A `Config` whose every traced leaf has a leading axis, for `jax.vmap(train)`: `leaves` vary, the others are repeated.
 
-    `leaves` are sequences of one length, for traced fields: `grid(config, seed=[0, 1], lam=[2.0, 2.4])` has two cells.
+    `leaves` are sequences of one length, for traced fields: `grid(config, seed=[0, 1], lam=[2.0, 2.4])` has two configurations.
 
     Raises:
       ValueError: a static or unknown field, values that make no sense, or sequences of different lengths.
@@ -280,6 +280,6 @@ def grid(config: Config, **leaves: Any) -> Config:
 
 def _check_sequence(field: dataclasses.Field, values: Any) -> None:
     if np.ndim(values) != 1 and not isinstance(values, jax.core.Tracer):
-        raise ValueError(f"{field.name} {shown(values)} is no sequence of values: give one for each cell")
+        raise ValueError(f"{field.name} {shown(values)} is no sequence of values: give one for each run")
     for value in values if isinstance(values, list | tuple) else [values]:
         check_value(field, value)

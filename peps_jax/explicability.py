@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -50,6 +51,7 @@ def score(problem: Problem, state: Any, action: Array, next_state: Any) -> Score
         log_belief=log_belief,
         log_true=expected.relative_log_prob(environment.perceive(next_state)),
     )
+    chex.assert_shape(list(worth), ())
     return Score(*(jnp.asarray(value, jnp.float32) for value in worth))
 
 
@@ -65,6 +67,9 @@ def episode_sums(values: Any, over: Array, running: Any) -> tuple[Any, Any]:
       sums: pytree of (steps, n), which at the transitions where `over` holds are the episodes' totals.
       running: sums of the episodes that go on.
     """
+
+    chex.assert_equal_shape([over, *jax.tree.leaves(values)])
+    chex.assert_equal_shape([over[0], *jax.tree.leaves(running)])
 
     def add(running: Any, step: tuple[Any, Array]) -> tuple[Any, Any]:
         value, over = step

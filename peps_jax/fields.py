@@ -1,4 +1,4 @@
-"""Fields of `Config`: help text, group and what values are right, kept as the field's metadata, and the checks of it."""
+"""Fields of `Config`: help text, group and what values make sense, kept as the field's metadata, and the checks of it."""
 
 from __future__ import annotations
 
@@ -16,54 +16,54 @@ from peps_envs.registry import unknown_name
 MOST = 2**31 - 1  # of whole numbers: sizes and seeds are 32-bit
 
 
-class Right(NamedTuple):
+class Range(NamedTuple):
     """What values of a setting make sense, as a test of one value and as words."""
 
     holds: Callable[[Any], Any]
     words: str
 
 
-NOT_NEGATIVE = Right(lambda value: (value >= 0) & np.isfinite(value), "0 or more")
-POSITIVE = Right(lambda value: (value > 0) & np.isfinite(value), "above 0")
-SHARE = Right(lambda value: (value >= 0) & (value <= 1), "from 0 to 1")
-COUNT = Right(lambda value: (value >= 1) & (value <= MOST), f"a whole number from 1 to {MOST}")
-COUNT_OR_NONE = Right(lambda value: (value >= 0) & (value <= MOST), f"a whole number from 0 to {MOST}")
-SIZES = Right(lambda value: COUNT.holds(value), f"one or more sizes, whole numbers from 1 to {MOST}")
-FLOOR = Right(lambda value: value < np.inf, "a number, or -inf for none")
-SWITCH = Right(lambda value: value is True or value is False, "True or False")
+NOT_NEGATIVE = Range(lambda value: (value >= 0) & np.isfinite(value), "0 or more")
+POSITIVE = Range(lambda value: (value > 0) & np.isfinite(value), "above 0")
+SHARE = Range(lambda value: (value >= 0) & (value <= 1), "from 0 to 1")
+COUNT = Range(lambda value: (value >= 1) & (value <= MOST), f"a whole number from 1 to {MOST}")
+COUNT_OR_NONE = Range(lambda value: (value >= 0) & (value <= MOST), f"a whole number from 0 to {MOST}")
+SIZES = Range(lambda value: COUNT.holds(value), f"one or more sizes, whole numbers from 1 to {MOST}")
+FLOOR = Range(lambda value: value < np.inf, "a number, or -inf for none")
+SWITCH = Range(lambda value: value is True or value is False, "True or False")
 
 
-def _one_of(choices: tuple[str, ...]) -> Right:
-    return Right(lambda value: value in choices, ", ".join(choices))
+def _one_of(choices: tuple[str, ...]) -> Range:
+    return Range(lambda value: value in choices, ", ".join(choices))
 
 
-def static(default: Any, right: Right | tuple[str, ...] | None, text: str, **metadata: Any) -> Any:
-    """A field that changes shapes or program structure: what is right, or the choices there are, and its help text."""
-    choices = right if isinstance(right, tuple) and not isinstance(right, Right) else None
-    right = right if choices is None else _one_of(choices)
-    metadata |= {"help": text, "right": right, "choices": choices}
+def static(default: Any, valid: Range | tuple[str, ...] | None, text: str, **metadata: Any) -> Any:
+    """A field that changes shapes or program structure: what makes sense, or the choices there are, and its help text."""
+    choices = valid if isinstance(valid, tuple) and not isinstance(valid, Range) else None
+    valid = valid if choices is None else _one_of(choices)
+    metadata |= {"help": text, "range": valid, "choices": choices}
     return struct.field(pytree_node=False, default=default, metadata=metadata)
 
 
-def traced(default: Any, right: Right | None, text: str, **metadata: Any) -> Any:
+def traced(default: Any, valid: Range | None, text: str, **metadata: Any) -> Any:
     """A field whose value is a leaf of the pytree."""
-    return struct.field(default=default, metadata={"help": text, "right": right, "choices": None, **metadata})
+    return struct.field(default=default, metadata={"help": text, "range": valid, "choices": None, **metadata})
 
 
 def check_value(field: dataclasses.Field, value: Any) -> None:
-    """Raises ValueError if a concrete value of `field`, or any of a batch of them, isn't right."""
-    right, default = field.metadata.get("right"), field.default
-    if right is None or isinstance(value, jax.core.Tracer):
+    """Raises ValueError if a concrete value of `field`, or any of a batch of them, makes no sense."""
+    valid, default = field.metadata.get("range"), field.default
+    if valid is None or isinstance(value, jax.core.Tracer):
         return
     try:
-        good = _is_kind(value, default) and bool(np.all(right.holds(_comparable(value, default))))
+        good = _is_kind(value, default) and bool(np.all(valid.holds(_comparable(value, default))))
     except (TypeError, ValueError, OverflowError):
         good = False
     if good:
         return
     if field.metadata["choices"] is not None:
         raise ValueError(unknown_name(field.name, value, field.metadata["choices"]))
-    raise ValueError(f"{field.name} {shown(value)} is out of range: choose {right.words}")
+    raise ValueError(f"{field.name} {shown(value)} is out of range: choose {valid.words}")
 
 
 def _is_kind(value: Any, default: Any) -> bool:

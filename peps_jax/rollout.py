@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -102,7 +103,9 @@ def collect(
         time, key = now
         key_act, key_env, key_reset = jax.random.split(key, 3)
         action = act(observation, key_act, time)
+        chex.assert_axis_dimension(action, 0, settings.num_envs)
         after = step(split(key_env), state, action, params)
+        chex.assert_shape([after.reward, after.terminated, after.truncated], (settings.num_envs,))
         seen, over = _seen(after.observation), after.terminated | after.truncated
         start, first = reset(split(key_reset), params)
         restart = lambda new, old: jax.vmap(jnp.where)(over, new, old)

@@ -139,7 +139,7 @@ def test_a_sweep_needs_no_utf_8(environment, swept, tmp_path):
     assert not [byte for byte in done.stdout.replace(os.fsencode(tmp_path / "größe"), b"") if byte > 127]
     names = sorted(path.relative_to(folder) for path in folder.rglob("*"))
     assert sorted(path.relative_to(tmp_path / "größe") for path in (tmp_path / "größe").rglob("*")) == names
-    for name in ("results.csv", "cells/nav-d1-sac-seed0.msgpack"):
+    for name in ("results.csv", "runs/nav-d1-sac-seed0.msgpack"):
         assert (tmp_path / "größe" / name).read_bytes() == (folder / name).read_bytes()
     assert "größe" in _command(tmp_path / "größe")
 
@@ -228,9 +228,9 @@ def test_long_compilation_rounds_and_evaluation_say_so(tiny, monkeypatch, capsys
         time.sleep(0.3)
     said = [line for line in capsys.readouterr().err.splitlines() if "so far" in line]
     assert said == [
-        "compiling peps, 1 cells, 0 s so far",
-        "training peps, 1 cells: 2 rounds are done, the next ones take, 0 s so far",
-        "evaluating peps, 1 cells, 0 s so far",
+        "compiling peps, 1 run, 0 s so far",
+        "training peps, 1 run: 2 rounds are done, the next ones take, 0 s so far",
+        "evaluating peps, 1 run, 0 s so far",
     ]
 
 

@@ -120,7 +120,7 @@ def test_every_field_has_a_check_and_a_help_text():
     for field in dataclasses.fields(Config):
         assert field.metadata["help"], field.name
         assert field.metadata["group"], field.name
-        assert (field.metadata["right"] is None) == (field.name in named), field.name
+        assert (field.metadata["range"] is None) == (field.name in named), field.name
 
 
 def test_every_field_reaches_a_part(tiny):
@@ -159,10 +159,10 @@ def test_static_fields_change_the_structure_and_traced_ones_do_not(line):
 
 
 def test_grid_gives_every_leaf_an_axis(line):
-    cells = grid(line, seed=[0, 1, 2], lam=[0.0, 1.0, 2.0])
-    assert all(leaf.shape[0] == 3 for leaf in jax.tree.leaves(cells))
-    np.testing.assert_array_equal(cells.lam, [0.0, 1.0, 2.0])
-    np.testing.assert_array_equal(cells.gamma, jnp.full(3, line.gamma))
+    configs = grid(line, seed=[0, 1, 2], lam=[0.0, 1.0, 2.0])
+    assert all(leaf.shape[0] == 3 for leaf in jax.tree.leaves(configs))
+    np.testing.assert_array_equal(configs.lam, [0.0, 1.0, 2.0])
+    np.testing.assert_array_equal(configs.gamma, jnp.full(3, line.gamma))
     beliefs = LineParams(noise=jnp.array([0.1, 0.2]), slope=jnp.ones(2), width=jnp.full(2, 0.1))
     np.testing.assert_allclose(grid(line, belief=beliefs).belief.noise, [0.1, 0.2])
 

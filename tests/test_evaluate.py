@@ -113,7 +113,7 @@ def test_evaluation_is_pure(line, train, evaluate):
 
 
 def test_by_default_episodes_follow_from_the_trainings_seed(line, train, evaluate):
-    """Under vmap over seeds, a cell's episodes are those of its single run."""
+    """Under vmap over seeds, a run's episodes are those of the run alone."""
     result, configs = train(line), peps_jax.grid(line, seed=[0, 3])
     trained_by = lambda config: result.replace(training=result.training.replace(config=config))
     batch = jax.jit(jax.vmap(lambda config: peps_jax.evaluate(trained_by(config), EPISODES)))(configs)

@@ -87,9 +87,9 @@ def test_every_setting_keeps_its_types_in_double_precision(method, changes):
 
 def test_a_batch_of_trainings_keeps_its_types_in_double_precision():
     with jax.enable_x64(True):
-        cells = grid(config_of("line", "peps"), seed=[0, 1], lam=[0.5, 2.0], gamma=np.array([0.9, 0.99]))
-        assert "float64" in kinds(cells)
-        result = jax.eval_shape(jax.vmap(peps_jax.train), cells)
+        configs = grid(config_of("line", "peps"), seed=[0, 1], lam=[0.5, 2.0], gamma=np.array([0.9, 0.99]))
+        assert "float64" in kinds(configs)
+        result = jax.eval_shape(jax.vmap(peps_jax.train), configs)
         assert kinds((result.agents, result.knowledge)) <= {"float32", "int32", "uint32"}
         assert kinds(result.curves) == {"float32"}
 

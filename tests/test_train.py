@@ -45,7 +45,7 @@ def first_state():
 
 @pytest.fixture(scope="module")
 def train_three():
-    """Three cells as one batch, traced once whatever their leaves are."""
+    """Three runs as one batch, traced once whatever their leaves are."""
     return jax.jit(jax.vmap(chex.assert_max_traces(peps_jax.train, n=1)))
 
 
@@ -78,7 +78,7 @@ def test_lam_changes_what_peps_learns(line, train):
     assert max(jax.tree.leaves(differences)) > 1e-3
 
 
-def three_cells(line, seeds, lams):
+def three_runs(line, seeds, lams):
     """A batch that varies what there is of kinds of leaves: the seed, weights, rates, and a belief's numbers."""
     return grid(
         line, seed=seeds, lam=lams, learning_rate=[1e-3, 2e-3, 1e-3],
@@ -86,33 +86,33 @@ def three_cells(line, seeds, lams):
     )  # fmt: skip
 
 
-def cell_of(batch, cell):
-    return jax.tree.map(lambda leaf: leaf[cell], batch)
+def run_of(batch, place):
+    return jax.tree.map(lambda leaf: leaf[place], batch)
 
 
 def test_a_vmapped_cell_matches_its_single_run(line, train, train_three):
-    cells = three_cells(line, [0, 0, 5], [0.0, 2.0, 2.4])
-    batch = train_three(cells)
-    for cell in range(3):
-        single = train(cell_of(cells, cell))
-        assert_close(cell_of(batch.agents, cell), single.agents, rtol=1e-2, atol=1e-3)
+    runs = three_runs(line, [0, 0, 5], [0.0, 2.0, 2.4])
+    batch = train_three(runs)
+    for place in range(3):
+        single = train(run_of(runs, place))
+        assert_close(run_of(batch.agents, place), single.agents, rtol=1e-2, atol=1e-3)
         for name in ("return_", "explicability", "surrogate_loss", "critic_loss"):
             np.testing.assert_allclose(
-                batch.curves[name][cell], single.curves[name], rtol=1e-2, atol=1e-3, err_msg=name
+                batch.curves[name][place], single.curves[name], rtol=1e-2, atol=1e-3, err_msg=name
             )
 
 
 def test_other_leaves_compile_nothing(line, train_three):
-    one = train_three(three_cells(line, [0, 0, 5], [0.0, 2.0, 2.4]))
-    two = train_three(three_cells(line.replace(gamma=0.9, rationality=2.0), [1, 2, 3], [0.5, 2.8, 1.0]))
+    one = train_three(three_runs(line, [0, 0, 5], [0.0, 2.0, 2.4]))
+    two = train_three(three_runs(line.replace(gamma=0.9, rationality=2.0), [1, 2, 3], [0.5, 2.8, 1.0]))
     assert not np.allclose(one.curves["surrogate_loss"], two.curves["surrogate_loss"])
 
 
 @pytest.mark.slow
 def test_a_vmapped_cell_matches_its_single_run_in_a_navigation_domain(tiny, train):
-    cells = grid(tiny.replace(method="sac"), seed=[0, 1], temperature=[1.0, 0.5])
-    batch = jax.jit(jax.vmap(peps_jax.train))(cells)
-    assert_close(cell_of(batch.agents, 1), train(cell_of(cells, 1)).agents, rtol=1e-2, atol=1e-3)
+    runs = grid(tiny.replace(method="sac"), seed=[0, 1], temperature=[1.0, 0.5])
+    batch = jax.jit(jax.vmap(peps_jax.train))(runs)
+    assert_close(run_of(batch.agents, 1), train(run_of(runs, 1)).agents, rtol=1e-2, atol=1e-3)
 
 
 def test_inside_somebody_elses_scan(line, train):

@@ -1,4 +1,4 @@
-"""Brax's SAC on the JAX world, through `peps_envs.bridges.to_brax`; see `protocol`."""
+"""Brax's SAC on the JAX environment, through `peps_envs.bridges.to_brax`; see `protocol`."""
 
 import functools
 

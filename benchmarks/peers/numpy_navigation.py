@@ -1,8 +1,8 @@
 """Navigation D1 as one would write it with NumPy: a Gymnasium environment, and many at a time for vectorised training.
 
-D1's true dynamics have no walls, ice, sand or noise, so neither has this world, which only makes it faster.
+D1's true dynamics have no walls, ice, sand or noise, so neither has this environment, which only makes it faster.
 
-    python peers/numpy_navigation.py check TRANSITIONS.json     prints the largest difference to those of the JAX world
+    python peers/numpy_navigation.py check TRANSITIONS.json     prints the largest difference to those of the JAX environment
     python peers/numpy_navigation.py rate COUNT SECONDS         prints a rate as `protocol` says; COUNT 1 is the Gymnasium one
 """
 
@@ -54,7 +54,7 @@ def move(positions: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 class Navigation(gymnasium.Env):
-    """One world."""
+    """One environment."""
 
     observation_space = gymnasium.spaces.Box(-1.0, 1.0, (OBSERVATION_SIZE,), np.float32)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -73,7 +73,7 @@ class Navigation(gymnasium.Env):
 
 
 class ManyNavigations:
-    """`count` worlds in one array; what ends begins anew."""
+    """`count` environments in one array; what ends begins anew."""
 
     def __init__(self, count: int):
         self.count = count
@@ -110,16 +110,16 @@ def rate(count: int, seconds: float, wait: bool) -> None:
     """Steps of random actions for about `seconds`."""
     random = np.random.default_rng(0)
     if count == 1:
-        world = Navigation()
-        world.reset(seed=0)
+        environment = Navigation()
+        environment.reset(seed=0)
 
         def step() -> None:
-            _, _, terminated, truncated, _ = world.step(random.uniform(-1.0, 1.0, 2))
+            _, _, terminated, truncated, _ = environment.step(random.uniform(-1.0, 1.0, 2))
             if terminated or truncated:
-                world.reset()
+                environment.reset()
     else:
-        worlds = ManyNavigations(count)
-        step = lambda: worlds.step(random.uniform(-1.0, 1.0, (count, 2)))
+        environments = ManyNavigations(count)
+        step = lambda: environments.step(random.uniform(-1.0, 1.0, (count, 2)))
     for _ in range(10):
         step()
     preparation = protocol.get_ready(wait)

@@ -1,4 +1,4 @@
-"""rejax's SAC on the JAX world, which a thin adapter shows as gymnax has it; see `protocol`.
+"""rejax's SAC on the JAX environment, which a thin adapter shows as gymnax has it; see `protocol`.
 
 Its evaluations are left out. Its targets follow once for each step of all environments, not once for each update, and it
 tunes its temperature: neither makes it slower by much.
@@ -17,7 +17,7 @@ WARMUP = 512  # environment steps before the first update
 
 
 class Navigation(environment.Environment):
-    """A peps_envs world; parameters are the true ones."""
+    """A peps_envs environment; parameters are the true ones."""
 
     def __init__(self, task: peps_envs.Task):
         self._task = task

@@ -1,11 +1,11 @@
-"""Stable-Baselines3's SAC on the NumPy world; see `protocol`."""
+"""Stable-Baselines3's SAC on the NumPy environment; see `protocol`."""
 
 import os
 import time
 
 import protocol
 import torch
-from sb3_world import NavigationVecEnv
+from sb3_environment import NavigationVecEnv
 from stable_baselines3 import SAC
 
 WARMUP = 1_024  # environment steps before those that are timed

@@ -1,9 +1,9 @@
-"""SBX's SAC (Stable-Baselines3's interface on JAX) on the NumPy world; see `protocol`."""
+"""SBX's SAC (Stable-Baselines3's interface on JAX) on the NumPy environment; see `protocol`."""
 
 import time
 
 import protocol
-from sb3_world import NavigationVecEnv
+from sb3_environment import NavigationVecEnv
 from sbx import SAC
 
 WARMUP = 1_024  # environment steps before those that are timed

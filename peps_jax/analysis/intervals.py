@@ -1,7 +1,7 @@
 """Statistics over runs and tasks with intervals, by rliable's definitions.
 
 Agarwal et al. 2021, "Deep Reinforcement Learning at the Edge of the Statistical Precipice". Scores are arrays (runs, tasks): a
-run is a training with a seed of its own, a task a world. A statistic takes (..., runs, tasks) and gives (...), so that all
+run is a training with a seed of its own, a task an environment. A statistic takes (..., runs, tasks) and gives (...), so that all
 resamples of a bootstrap are one call.
 
     estimate(interquartile_mean, scores)                     # of one method

@@ -1,4 +1,4 @@
-"""Many cells at once: divided into batches, each with a structure of its own and small enough for the devices' memory."""
+"""Many runs at once: divided into batches, each with a structure of its own and small enough for the devices' memory."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from peps_jax.execution.devices import side_by_side
 from peps_jax.execution.program import FinishedRun, Progress, Times, memory_need, program, structure
 from peps_jax.preferences.data import PreferenceSet
 
-CELLS_PER_DEVICE = 5  # of a CPU in one batch at most, where it matters that a batch is soon done and kept
+RUNS_PER_DEVICE = 5  # of a CPU in one batch at most, where it matters that a batch is soon done and kept
 
 
 class Batch(NamedTuple):
-    """Cells that run together in one program."""
+    """Runs that go together in one program."""
 
-    cells: tuple[int, ...]  # places in the list that was planned
-    slots: int  # cells that the program has room for, a multiple of its devices unless there are fewer cells
+    runs: tuple[int, ...]  # places in the list that was planned
+    slots: int  # runs that the program has room for, a multiple of its devices unless there are fewer runs
     devices: tuple[jax.Device, ...]
 
 
@@ -38,19 +38,19 @@ class Watch:
     def advanced(
         self, batch: Batch, rounds: int, curves: dict[str, np.ndarray], snapshot: Callable[[], Progress]
     ) -> None:
-        """So many rounds of a batch are done, the last of them with these curves (cells, rounds)."""
+        """So many rounds of a batch are done, the last of them with these curves (runs, rounds)."""
 
-    def finished(self, batch: Batch, cells: Sequence[FinishedRun], times: Times) -> None:
+    def finished(self, batch: Batch, runs: Sequence[FinishedRun], times: Times) -> None:
         """A batch is trained and evaluated."""
 
 
-def cells_soon_done(devices: Sequence[jax.Device]) -> int | None:
-    """`most` of `plan` for batches that are soon done and kept; None of devices that are quicker with many cells."""
-    return None if side_by_side(devices) else CELLS_PER_DEVICE * len(devices)
+def runs_soon_done(devices: Sequence[jax.Device]) -> int | None:
+    """`most` of `plan` for batches that are soon done and kept; None of devices that are quicker with many runs."""
+    return None if side_by_side(devices) else RUNS_PER_DEVICE * len(devices)
 
 
 def plan(
-    cells: Sequence[Config],
+    configs: Sequence[Config],
     num_episodes: int = 100,
     devices: Sequence[jax.Device] | None = None,
     free: int | None = None,
@@ -58,34 +58,34 @@ def plan(
     shares: int = 1,
     recorded: PreferenceSet | None = None,
 ) -> list[Batch]:
-    """Divides cells into batches: one structure each, and split further where they would not fit in memory.
+    """Divides runs into batches: one structure each, and split further where they would not fit in memory.
 
     Args:
-      devices: that share the cells; all by default.
+      devices: that share the runs; all by default.
       free: bytes that each device has; measured by default.
-      most: cells in a batch at most, for a batch to be done and kept sooner; as many as fit by default.
+      most: runs in a batch at most, for a batch to be done and kept sooner; as many as fit by default.
       recorded: preferences that every training is given before it begins.
-      shares: that the cells of each structure are at least cut into, for as many processes with such devices.
+      shares: that the runs of each structure are at least cut into, for as many processes with such devices.
 
     Raises:
-      OutOfMemoryError: one cell for each device, or even a single one, is too much.
+      OutOfMemoryError: one run for each device, or even a single one, is too much.
     """
     devices = tuple(jax.devices() if devices is None else devices)
     groups: dict[Any, list[int]] = {}
-    for place, cell in enumerate(cells):
-        groups.setdefault(structure(cell), []).append(place)
+    for place, config in enumerate(configs):
+        groups.setdefault(structure(config), []).append(place)
     batches = []
     for places in groups.values():
         used = devices[: -(-len(places) // shares)]
         room = memory.available_bytes(used) if free is None else free
-        need = memory_need(cells[places[0]], num_episodes, recorded)
-        fit = memory.cells_that_fit(need, room, side_by_side(used)) * len(used)
+        need = memory_need(configs[places[0]], num_episodes, recorded)
+        fit = memory.runs_that_fit(need, room, side_by_side(used)) * len(used)
         if fit < 1:
             wanted, given = (
                 memory.readable(size) for size in (need.working + 3 * need.state, memory.AVAILABLE_SHARE * room)
             )
             raise memory.OutOfMemoryError(
-                f"a {cells[places[0]].method} cell needs about {wanted} of memory and each of {len(used)} devices has {given} "
+                f"a {configs[places[0]].method} run needs about {wanted} of memory and each of {len(used)} devices has {given} "
                 "for it: lower total_steps, batch_size, updates_per_step, num_envs or the hidden sizes"
             )
         number = -(-len(places) // (fit if most is None else min(fit, most)))
@@ -97,17 +97,17 @@ def plan(
 
 
 def run(
-    cells: Sequence[Config],
+    configs: Sequence[Config],
     batches: Sequence[Batch],
     num_episodes: int,
     watch: Watch,
     recorded: PreferenceSet | None = None,
 ) -> None:
-    """Trains and evaluates `cells` batch by batch, as `batches` divide them; `watch` gets each when it is done."""
+    """Trains and evaluates `configs` batch by batch, as `batches` divide them; `watch` gets each when it is done."""
     for batch in batches:
         watch.compiling(batch)
-        compiled, compiling = program(cells[batch.cells[0]], batch.slots, num_episodes, batch.devices, recorded)
+        compiled, compiling = program(configs[batch.runs[0]], batch.slots, num_episodes, batch.devices, recorded)
         start = watch.start(batch)
         report = functools.partial(watch.advanced, batch)
-        finished, running = compiled.run([cells[place] for place in batch.cells], report, start)
+        finished, running = compiled.run([configs[place] for place in batch.runs], report, start)
         watch.finished(batch, finished, compiling + running)

@@ -91,7 +91,7 @@ class Checkpoints:
 
     Args:
       folder: theirs alone; it need not exist.
-      about: what has to be equal for a checkpoint to be read: versions, settings, cells. JSON knows it.
+      about: what has to be equal for a checkpoint to be read: versions, settings, runs. JSON knows it.
     """
 
     def __init__(self, folder: Path, about: Mapping[str, Any]):

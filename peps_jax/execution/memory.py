@@ -27,14 +27,14 @@ IN_PLACE = {
 
 
 class Need(NamedTuple):
-    """Predicted bytes of one cell."""
+    """Predicted bytes of one run."""
 
     state: int  # what a training carries from round to round
     working: int  # what a round, or the evaluation, has in use beside it at most
 
 
 class OutOfMemoryError(ValueError):
-    """Not even one cell fits."""
+    """Not even one run fits."""
 
 
 def size_of(value: Any) -> int:
@@ -98,22 +98,22 @@ def _container_bytes() -> float:
         return float("inf")
 
 
-def cells_that_fit(need: Need, free: int, together: bool) -> int:
-    """How many cells fit on a device: the largest k whose `bytes_needed` are at most AVAILABLE_SHARE * free."""
+def runs_that_fit(need: Need, free: int, together: bool) -> int:
+    """How many runs fit on a device: the largest k whose `bytes_needed` are at most AVAILABLE_SHARE * free."""
     free = int(AVAILABLE_SHARE * free)
     each = bytes_needed(need, 2, together) - bytes_needed(need, 1, together)
     return max(0, free - bytes_needed(need, 0, together)) // each
 
 
-def bytes_needed(need: Need, cells: int, together: bool) -> int:
-    """Bytes of a device that has `cells` cells.
+def bytes_needed(need: Need, runs: int, together: bool) -> int:
+    """Bytes of a device that has `runs` runs.
 
-    The state counts twice, because new states are written beside the old ones. Cells that are worked on `together` all need
+    The state counts twice, because new states are written beside the old ones. Runs that are worked on `together` all need
     their working memory; one after the other they need it once, and a copy of the state that is worked on.
     """
     if together:
-        return cells * (2 * need.state + need.working)
-    return (2 * cells + 1) * need.state + need.working
+        return runs * (2 * need.state + need.working)
+    return (2 * runs + 1) * need.state + need.working
 
 
 def readable(number: float) -> str:

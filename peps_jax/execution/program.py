@@ -1,6 +1,6 @@
-"""A training's program: initialised, advanced and evaluated for many cells at once, compiled once for each structure.
+"""A training's program: initialised, advanced and evaluated for many runs at once, compiled once for each structure.
 
-Cells whose `Config`s differ only in traced leaves share a program; environments that share code do too, because their numbers
+Runs whose `Config`s differ only in traced leaves share a program; environments that share code do too, because their numbers
 are leaves.
 """
 
@@ -50,17 +50,17 @@ class Progress(NamedTuple):
     """A batch between two rounds, as numpy arrays: all that it takes to go on, in another process too."""
 
     rounds: int  # done
-    state: TrainingState  # every leaf (cells, ...); random keys as their data
-    curves: dict[str, np.ndarray]  # (cells, rounds) each
+    state: TrainingState  # every leaf (runs, ...); random keys as their data
+    curves: dict[str, np.ndarray]  # (runs, rounds) each
     seconds: float  # of training so far
 
 
 Report = Callable[
     [int, dict[str, np.ndarray], Callable[[], Progress]], None
-]  # rounds done, curves (cells, rounds of the chunk), and what makes the batch's `Progress`
+]  # rounds done, curves (runs, rounds of the chunk), and what makes the batch's `Progress`
 
 
-# --- what one cell's training is made of ------------------------------------------------------------------------------------
+# --- what one training is made of -------------------------------------------------------------------------------------------
 
 
 def shared(config: Config) -> Config:
@@ -70,60 +70,60 @@ def shared(config: Config) -> Config:
 
 
 def structure(config: Config) -> Any:
-    """What decides which program a cell needs: equal for cells that differ only in the values of traced leaves."""
+    """What decides which program a run needs: equal for runs that differ only in the values of traced leaves."""
     leaves, tree = jax.tree.flatten(shared(config))
     return tree, tuple(jnp.shape(leaf) for leaf in leaves)
 
 
 def written(config: Config, *more: Any) -> str | None:
     """`structure` as text, for another process to recognise; None if code decides it that isn't this project's."""
-    cell = shared(config)
-    ours = [type(cell.env), *(part for part in methods.get(cell.method) if callable(part))]
+    one = shared(config)
+    ours = [type(one.env), *(part for part in methods.get(one.method) if callable(part))]
     if any(part.__module__.split(".")[0] not in ("peps_jax", "peps_envs") for part in ours):
         return None
-    leaves, tree = jax.tree.flatten(cell)
+    leaves, tree = jax.tree.flatten(one)
     return repr([tree, [(jnp.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves], *more])
 
 
-def stack(cells: Sequence[Config]) -> Config:
-    """One `Config` whose every leaf has a leading axis of cells."""
-    return devices.stack([shared(cell) for cell in cells])
+def stack(configs: Sequence[Config]) -> Config:
+    """One `Config` whose every leaf has a leading axis of runs."""
+    return devices.stack([shared(config) for config in configs])
 
 
-def begin(cell: Config, recorded: PreferenceSet | None = None) -> TrainingState:
+def begin(config: Config, recorded: PreferenceSet | None = None) -> TrainingState:
     """The state before the first round, whether or not anything was recorded before."""
     teacher = teachers.SYNTHETIC if recorded is None else teachers.recorded(recorded)
-    return init(prepare(cell, teacher), teacher)
+    return init(prepare(config, teacher), teacher)
 
 
-def advance(state: TrainingState, indices: jax.Array, cell: Config) -> Any:
+def advance(state: TrainingState, indices: jax.Array, config: Config) -> Any:
     """Rounds `indices`: state and curves. The same program whether or not anything was recorded before."""
-    return run_rounds(state, indices, prepare(cell))
+    return run_rounds(state, indices, prepare(config))
 
 
-def score(state: TrainingState, cell: Config, num_episodes: int) -> Evaluation:
+def score(state: TrainingState, config: Config, num_episodes: int) -> Evaluation:
     """The evaluation of what was learned."""
-    return evaluate(finish(state, {}, prepare(cell)), num_episodes)
+    return evaluate(finish(state, {}, prepare(config)), num_episodes)
 
 
-def empty_progress(cell: Config, cells: int, recorded: PreferenceSet | None = None) -> TrainingState:
-    """Shapes and types of the state of a `Progress` of `cells` cells like `cell`."""
-    shapes = jax.eval_shape(lambda cell: _key_data(begin(cell, recorded)), shared(cell))
-    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((cells, *leaf.shape), leaf.dtype), shapes)
+def empty_progress(config: Config, runs: int, recorded: PreferenceSet | None = None) -> TrainingState:
+    """Shapes and types of the state of a `Progress` of `runs` runs like that of `config`."""
+    shapes = jax.eval_shape(lambda config: _key_data(begin(config, recorded)), shared(config))
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((runs, *leaf.shape), leaf.dtype), shapes)
 
 
-def empty_finished(cell: Config, num_episodes: int) -> tuple[TrainingState, Evaluation]:
-    """Shapes and types of what a training like `cell` and its evaluation leave, curves apart."""
+def empty_finished(config: Config, num_episodes: int) -> tuple[TrainingState, Evaluation]:
+    """Shapes and types of what a training by `config` and its evaluation leave, curves apart."""
 
-    def finished(cell: Config) -> tuple[TrainingState, Evaluation]:
-        state = begin(cell)
-        return state, score(state, cell, num_episodes)
+    def finished(config: Config) -> tuple[TrainingState, Evaluation]:
+        state = begin(config)
+        return state, score(state, config, num_episodes)
 
-    return jax.eval_shape(finished, shared(cell))
+    return jax.eval_shape(finished, shared(config))
 
 
 def memory_need(config: Config, num_episodes: int, recorded: PreferenceSet | None = None) -> memory.Need:
-    """Predicts a cell's bytes from shapes alone, without compiling.
+    """Predicts a run's bytes from shapes alone, without compiling.
 
     `state` is exact: agent, knowledge, preferences, replay and actors, by `jax.eval_shape` of `begin`. `working` walks the traced
     program of a round (and of the evaluation) and takes the largest sum of values that are in use at the same time, as if
@@ -137,13 +137,13 @@ def memory_need(config: Config, num_episodes: int, recorded: PreferenceSet | Non
 
 
 def _memory_need(config: Config, num_episodes: int, recorded: PreferenceSet | None) -> memory.Need:
-    cell, indices = shared(config), jnp.zeros(1, jnp.int32)
-    one_round = lambda state, cell: run_round(state, indices[0], prepare(cell))
+    one, indices = shared(config), jnp.zeros(1, jnp.int32)
+    one_round = lambda state, config: run_round(state, indices[0], prepare(config))
     try:
-        state = jax.eval_shape(lambda cell: begin(cell, recorded), cell)
+        state = jax.eval_shape(lambda config: begin(config, recorded), one)
         programs = [
-            jax.make_jaxpr(one_round)(state, cell),
-            jax.make_jaxpr(lambda state, cell: score(state, cell, num_episodes))(state, cell),
+            jax.make_jaxpr(one_round)(state, one),
+            jax.make_jaxpr(lambda state, config: score(state, config, num_episodes))(state, one),
         ]
     except OverflowError:  # sizes that an index can't count
         return memory.Need(state=2**63, working=0)
@@ -169,48 +169,49 @@ def chunk_lengths(num_rounds: int) -> list[int]:
 
 
 class Program:
-    """A structure's training and evaluation, compiled for a number of cells on some devices.
+    """A structure's training and evaluation, compiled for a number of runs on some devices.
 
     Args:
-      cell: any with the structure.
-      slots: cells that it has room for.
-      recorded: preferences that were given before, the same for every cell.
+      config: any with the structure.
+      slots: runs that it has room for.
+      recorded: preferences that were given before, the same for every run.
     """
 
     def __init__(
         self,
-        cell: Config,
+        config: Config,
         slots: int,
         num_episodes: int,
         used: Sequence[jax.Device],
         recorded: PreferenceSet | None = None,
     ):
-        self._cell, self._slots, self._num_episodes, self._recorded = cell, slots, num_episodes, recorded
+        self._config, self._slots, self._num_episodes, self._recorded = config, slots, num_episodes, recorded
         self._devices, self._sharding = tuple(used), devices.sharding(used)
-        self._chunks = chunk_lengths(cell.num_rounds)
+        self._chunks = chunk_lengths(config.num_rounds)
         self._compiled: dict[str, Any] = {}
 
     def compile(self) -> float:
         """Compiles, or takes what was compiled before; returns the seconds that it took."""
         start = time.perf_counter()
-        about = written(self._cell, self._slots, self._num_episodes, _shapes_of(self._recorded))
+        about = written(self._config, self._slots, self._num_episodes, _shapes_of(self._recorded))
         self._compiled = compilation_cache.kept(about, self._compile, self._devices)
         return time.perf_counter() - start
 
     def _compile(self) -> dict[str, Any]:
         """The programs by name."""
-        cells = self._shapes(stack([self._cell] * self._slots))
+        leaves = self._shapes(stack([self._config] * self._slots))
         recorded = self._recorded
-        state = self._shapes(jax.eval_shape(jax.vmap(begin, in_axes=(0, None)), cells, recorded))
+        state = self._shapes(jax.eval_shape(jax.vmap(begin, in_axes=(0, None)), leaves, recorded))
         over = lambda function, **which: devices.over_devices(function, self._devices, **which)
         further = over(advance, whole=(1,), donate=(0,))
         indices = lambda length: jax.ShapeDtypeStruct((length,), jnp.int32)
-        evaluation = lambda state, cell: score(state, cell, self._num_episodes)
+        evaluation = lambda state, config: score(state, config, self._num_episodes)
         lowered = {
-            "init": over(begin, whole=(1,)).lower(cells, recorded),
-            "evaluate": over(evaluation).lower(state, cells),
+            "init": over(begin, whole=(1,)).lower(leaves, recorded),
+            "evaluate": over(evaluation).lower(state, leaves),
             **{
-                f"{length} rounds": further.lower(state, indices(length), cells) for length in sorted(set(self._chunks))
+                f"{length} rounds": further.lower(state, indices(length), leaves)
+                for length in sorted(set(self._chunks))
             },
         }
         with ThreadPoolExecutor() as pool:  # the compiler works outside Python's lock
@@ -230,15 +231,15 @@ class Program:
         return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=self._sharding), tree)
 
     def run(
-        self, cells: Sequence[Config], report: Report = lambda *_: None, start: Progress | None = None
+        self, configs: Sequence[Config], report: Report = lambda *_: None, start: Progress | None = None
     ) -> tuple[list[FinishedRun], Times]:
-        """Trains and evaluates `cells`, at most `slots`, and tells `report` after every chunk of rounds.
+        """Trains and evaluates `configs`, at most `slots`, and tells `report` after every chunk of rounds.
 
         Args:
-          start: where an earlier run of the same cells was; the numbers are those of a run without a break.
+          start: how far the same runs were before; the numbers are those of a run without a break.
         """
-        number = len(cells)
-        leaves = jax.device_put(stack(devices.padded(cells, self._slots)), self._sharding)
+        number = len(configs)
+        leaves = jax.device_put(stack(devices.padded(configs, self._slots)), self._sharding)
         began = time.perf_counter()
         if start is None:
             state, done, chunks, earlier = self._compiled["init"](leaves, self._recorded), 0, [], 0.0
@@ -261,11 +262,11 @@ class Program:
         times = Times(run=earlier + trained - began, evaluate=time.perf_counter() - trained)
         rows = (*learned, _joined(chunks), evaluations)
         own = lambda place: jax.tree.map(lambda values: values[place], rows)
-        return [self._finished(cell, *own(place)) for place, cell in enumerate(cells)], times
+        return [self._finished(config, *own(place)) for place, config in enumerate(configs)], times
 
-    def _finished(self, cell: Config, agents: Any, knowledge: Any, preferences: Any, curves: Any, evaluation: Any):
+    def _finished(self, config: Config, agents: Any, knowledge: Any, preferences: Any, curves: Any, evaluation: Any):
         return FinishedRun(
-            training=prepare(cell),
+            training=prepare(config),
             agents=agents,
             knowledge=knowledge,
             preferences=preferences,
@@ -284,7 +285,7 @@ class Program:
     def _resumed(self, start: Progress) -> TrainingState:
         """`start`'s state on the devices."""
         places = np.asarray(devices.padded(range(len(jax.tree.leaves(start.state)[0])), self._slots))
-        shapes = jax.eval_shape(lambda cell: begin(cell, self._recorded), shared(self._cell))
+        shapes = jax.eval_shape(lambda config: begin(config, self._recorded), shared(self._config))
         keys = lambda leaf, shape: jax.random.wrap_key_data(leaf) if _is_key(shape) else leaf
         state = jax.tree.map(keys, jax.tree.map(lambda leaf: leaf[places], start.state), shapes)
         return jax.device_put(state, self._sharding)
@@ -299,7 +300,7 @@ def _key_data(state: TrainingState) -> TrainingState:
 
 
 def _on_host(state: TrainingState, number: int) -> TrainingState:
-    """The first `number` cells of `state` as numpy arrays."""
+    """The first `number` runs of `state` as numpy arrays."""
     return jax.tree.map(lambda leaf: np.array(leaf[:number]), jax.device_get(_key_data(state)))
 
 
@@ -319,15 +320,15 @@ _PROGRAMS: dict[Any, Program] = {}  # compiled in this process, as `jax.jit` kee
 
 
 def program(
-    cell: Config,
+    config: Config,
     slots: int,
     num_episodes: int,
     used: tuple[jax.Device, ...],
     recorded: PreferenceSet | None = None,
 ) -> tuple[Program, Times]:
-    """The compiled program for cells like `cell`, and what it took: nothing if it was compiled before in this process."""
-    key = structure(cell), slots, used, num_episodes, id(recorded)
+    """The compiled program for runs like that of `config`, and what it took: nothing if it was compiled before in this process."""
+    key = structure(config), slots, used, num_episodes, id(recorded)
     if key in _PROGRAMS:
         return _PROGRAMS[key], Times()
-    _PROGRAMS[key] = Program(cell, slots, num_episodes, used, recorded)
+    _PROGRAMS[key] = Program(config, slots, num_episodes, used, recorded)
     return _PROGRAMS[key], Times(compile=_PROGRAMS[key].compile())

@@ -27,7 +27,7 @@ class Display(batches.Watch):
     """Progress on stderr: a bar on a terminal, a line now and then elsewhere. What takes long without any says so.
 
     Args:
-      configs: of all cells.
+      configs: of all runs.
       batches: that are to be run.
       keep: gets each batch when it is done.
       name: of who speaks, where several processes do.
@@ -43,7 +43,7 @@ class Display(batches.Watch):
 
         self._configs, self._batches, self._keep = configs, list(batches), keep
         self._name = f"{name}: " if name else ""
-        self._total = sum(env_steps(configs[place]) for one in batches for place in one.cells)
+        self._total = sum(env_steps(configs[place]) for one in batches for place in one.runs)
         self._done, self._figures, self._doing = 0, "", ""
         console = Console(stderr=True)
         columns = (TextColumn("{task.description}"), BarColumn(None), TaskProgressColumn(), TimeRemainingColumn())
@@ -94,15 +94,16 @@ class Display(batches.Watch):
         self._before, self._started = self._done, time.perf_counter()
         self._printed = self._started
 
-    def finished(self, batch: batches.Batch, cells: Sequence[FinishedRun], times: Times) -> None:
-        self._keep(batch, cells, times)
+    def finished(self, batch: batches.Batch, runs: Sequence[FinishedRun], times: Times) -> None:
+        self._keep(batch, runs, times)
 
     def _described(self, batch: batches.Batch) -> str:
         number = f", batch {self._batches.index(batch) + 1}/{len(self._batches)}" * (len(self._batches) > 1)
-        return f"{self._configs[batch.cells[0]].method}, {len(batch.cells)} cells{number}"
+        runs = f"{len(batch.runs)} run" + "s" * (len(batch.runs) > 1)
+        return f"{self._configs[batch.runs[0]].method}, {runs}{number}"
 
     def _steps_per_round(self, batch: batches.Batch) -> int:
-        return sum(self._configs[place].steps_per_round for place in batch.cells)
+        return sum(self._configs[place].steps_per_round for place in batch.runs)
 
     def advanced(
         self, batch: batches.Batch, rounds: int, curves: dict[str, np.ndarray], snapshot: Callable[[], program.Progress]
@@ -121,7 +122,7 @@ class Display(batches.Watch):
             self._printed = now
             share, left = 100 * self._done / self._total, (self._total - self._done) / speed
             print_line(f"{self._name}{self._doing}: {share:.0f} %, {left:.0f} s left, {self._figures}")
-        if rounds == self._configs[batch.cells[0]].num_rounds:
+        if rounds == self._configs[batch.runs[0]].num_rounds:
             self._reminder.about(f"evaluating {self._described(batch)}")
         else:
             self._reminder.about(f"{self._doing}: {rounds} rounds are done, the next ones take")

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import chex
 import distrax
 import jax
 import jax.numpy as jnp
@@ -75,6 +76,7 @@ def product_of_gaussians(policies: Gaussian) -> Gaussian:
 
     Before tanh: the product of squashed densities would count tanh's Jacobian once for each.
     """
+    chex.assert_equal_shape([policies.mean, policies.log_sd])
     # relative to the narrowest, so that no precision overflows
     narrowest = jnp.min(policies.log_sd, 0)
     weight = jnp.exp(2 * (narrowest[None] - policies.log_sd))

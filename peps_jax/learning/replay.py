@@ -1,6 +1,6 @@
 """Replay: everything that happened in a training, in the order of its rounds.
 
-Rounds write at a position that follows from the round's index, which is the same for every cell of a batch. So under `vmap`
+Rounds write at a position that follows from the round's index, which is the same for every run of a batch. So under `vmap`
 a write stays one slice of the buffer instead of a scatter, and nothing is ever overwritten: the capacity is a whole training.
 """
 

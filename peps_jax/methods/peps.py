@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import chex
 import jax
 from flax import struct
 from jax import Array
@@ -52,6 +53,7 @@ def reward(knowledge: Knowledge, transitions: Transition, settings: Settings) ->
     observation, action, objective = transitions.observation, transitions.action, settings.objective
     preferred = surrogate.predict(knowledge.surrogate, observation, action, settings.surrogate)
     entropy = dynamics.environment_entropy(knowledge.dynamics, observation, action, settings.dynamics)
+    chex.assert_equal_shape([transitions.reward, preferred, entropy])
     explicable = (
         objective.surrogate_weight * preferred
         + objective.environment_entropy_weight * entropy

@@ -175,7 +175,7 @@ class Plan:
     def batches(self, trainings: Sequence[Training]) -> list[batches.Batch]:
         """How `trainings` are divided. Raises OutOfMemoryError, a ValueError, if one doesn't fit."""
         configs = [training.config for training in trainings]
-        return batches.plan(configs, self.num_episodes, most=batches.cells_soon_done(jax.devices()))
+        return batches.plan(configs, self.num_episodes, most=batches.runs_soon_done(jax.devices()))
 
     def make(self, missing: Sequence[Need], store: Store) -> None:
         """Makes what is missing; each batch is kept as soon as it is done."""
@@ -191,9 +191,9 @@ class Plan:
         trainings = [what for what in missing if isinstance(what, Training)]
 
         def keep_batch(done: batches.Batch, finished: Sequence[FinishedRun], times: Times) -> None:
-            seconds = (times.run + times.evaluate) / len(done.cells)
-            for place, cell in zip(done.cells, finished, strict=True):
-                keep(trainings[place], _reduce(cell, self.num_episodes, seconds))
+            seconds = (times.run + times.evaluate) / len(done.runs)
+            for place, run in zip(done.runs, finished, strict=True):
+                keep(trainings[place], _reduce(run, self.num_episodes, seconds))
 
         if trainings:
             configs = [training.config for training in trainings]
@@ -202,19 +202,19 @@ class Plan:
                 batches.run(configs, divided, self.num_episodes, display)
 
 
-def _reduce(cell: FinishedRun, num_episodes: int, seconds: float) -> Record:
+def _reduce(run: FinishedRun, num_episodes: int, seconds: float) -> Record:
     """What is kept of a finished training, its samples' evaluation and r-hat over the map among it."""
     # names in place of which the training has code and numbers: every environment shares these programs
-    result = Result(cell.training.replace(config=shared(cell.config)), cell.agents, cell.knowledge, None, {})
+    result = Result(run.training.replace(config=shared(run.config)), run.agents, run.knowledge, None, {})
     heat = {}
     if result.surrogate is not None:
         heat = dict(zip(("learned", "true", "free"), surrogate_values(result), strict=True))
     return Record(
-        mode=episodes(cell.evaluation),
+        mode=episodes(run.evaluation),
         sampled=episodes(_evaluate_samples(result, num_episodes)),
-        routes=np.asarray(cell.evaluation.perceived[:ROUTES]),
+        routes=np.asarray(run.evaluation.perceived[:ROUTES]),
         heat=heat,
-        failed=cell.failed,
+        failed=run.failed,
         seconds=seconds,
     )
 

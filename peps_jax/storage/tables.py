@@ -20,13 +20,13 @@ def csv_bytes(records: Sequence[Mapping[str, Any]]) -> bytes:
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A table in Markdown."""
-    shown = lambda cells: "| " + " | ".join(cells) + " |"
+    shown = lambda row: "| " + " | ".join(row) + " |"
     return "\n".join([shown(head), "|" + "---|" * len(head), *map(shown, rows)]) + "\n"
 
 
 def latex(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table in LaTeX, for the package booktabs; a rule wherever the first column changes."""
-    shown = lambda cells: " & ".join(map(_escaped, cells)) + r" \\"
+    shown = lambda row: " & ".join(map(_escaped, row)) + r" \\"
     lines = [rf"\begin{{tabular}}{{ll{'r' * (len(head) - 2)}}}", r"\toprule", shown(head), r"\midrule"]
     for place, row in enumerate(rows):
         if place and row[0] != rows[place - 1][0]:

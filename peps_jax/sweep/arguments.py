@@ -1,4 +1,4 @@
-"""What a sweep's command line asks for: flags, the grid of cells that they make, and whether all of it makes sense."""
+"""What a sweep's command line asks for: flags, the grid of rows that they make, and whether all of it makes sense."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from peps_jax.preferences import data, teachers
 from peps_jax.preferences.data import PreferenceSet
 from peps_jax.storage import files
 from peps_jax.sweep import meeting, results
-from peps_jax.sweep.results import Cell
+from peps_jax.sweep.results import Key
 from peps_jax.train import check, prepare
 
 PROG = called("peps_jax.sweep", "peps-sweep")
@@ -29,7 +29,7 @@ GRID = ("env", "method", "lam")  # fields of which a sweep takes several values
 DEMONSTRATION = {"env": ("nav-d1", "nav-d4"), "method": ("peps", "sac"), "lam": (2.4,)}
 
 DESCRIPTION = """\
-Trains every cell of a grid of environments, methods, lambdas and seeds, side by side on all
+Trains every combination of environments, methods, lambdas and seeds, side by side on all
 devices, and writes tables, curves, learned parameters and pictures into a folder.
 Without flags: a demonstration of a few minutes."""
 
@@ -71,8 +71,8 @@ class Flags(NamedTuple):
 class Request:
     """What a command line asks for, checked."""
 
-    cells: list[Cell]  # the grid, in the order of the table
-    trainings: dict[str, Config]  # by name; several cells may show one
+    keys: list[Key]  # of the rows, in the order of the table
+    trainings: dict[str, Config]  # by name; several rows may show one
     settings: dict[str, Any]  # as in `Flags`
     running: dict[str, Any]
     preferences: PreferenceSet | None  # recorded, from which all trainings learn
@@ -192,10 +192,10 @@ def understood(asked: Flags) -> Request:
     for name in ("seeds", "episodes"):
         if not 1 <= settings[name] <= MOST:
             raise ValueError(f"{name} {settings[name]} is out of range: choose 1 to {MOST}")
-    last = 2**31 - settings["seeds"]  # a cell's seed is a 32-bit number
+    last = 2**31 - settings["seeds"]  # a seed is a 32-bit number
     if not 0 <= settings["seed"] <= last:
         raise ValueError(f"seed {settings['seed']} is out of range: choose 0 to {last}")
-    cells, trainings = grid(settings)
+    keys, trainings = grid(settings)
     preferences = None
     if settings["preferences"] is not None:
         settings = settings | {"preferences": str(Path(settings["preferences"]).resolve())}
@@ -204,7 +204,7 @@ def understood(asked: Flags) -> Request:
         results.check_free(out)
     files.check_writable(out)
     begun_by = begun_by or _as_text(shlex.join([*PROG.split(), *asked.arguments]))
-    return Request(cells, trainings, settings, running, preferences, stored is not None, begun_by)
+    return Request(keys, trainings, settings, running, preferences, stored is not None, begun_by)
 
 
 def _as_text(command: str) -> str:
@@ -212,20 +212,20 @@ def _as_text(command: str) -> str:
     return os.fsencode(command).decode("utf-8", "surrogateescape")
 
 
-def grid(settings: Mapping[str, Any]) -> tuple[list[Cell], dict[str, Config]]:
-    """The cells that `settings` ask for, and their trainings by name. Raises ValueError for settings that make no sense."""
+def grid(settings: Mapping[str, Any]) -> tuple[list[Key], dict[str, Config]]:
+    """The rows that `settings` ask for, and their trainings by name. Raises ValueError for settings that make no sense."""
     fields = [field.name for field in dataclasses.fields(Config) if field.name in settings and field.name not in GRID]
     fixed = {name: settings[name] for name in fields}
-    cells, trainings = [], {}
+    keys, trainings = [], {}
     seeds = range(settings["seed"], settings["seed"] + settings["seeds"])
     for env, method, lam in itertools.product(*(settings[name] for name in GRID)):
         config = Config(**(fixed | {"env": env, "method": method, "lam": lam}))
         check(config)
         for seed in seeds:
             own = f"lam{lam}-" if methods.get(method).uses_lam else ""
-            cells.append(Cell(env, method, lam, seed, training=f"{env}-{method}-{own}seed{seed}"))
-            trainings.setdefault(cells[-1].training, config.replace(seed=seed))
-    return cells, trainings
+            keys.append(Key(env, method, lam, seed, training=f"{env}-{method}-{own}seed{seed}"))
+            trainings.setdefault(keys[-1].training, config.replace(seed=seed))
+    return keys, trainings
 
 
 def _recorded(file: str, configs: Sequence[Config]) -> PreferenceSet:

@@ -1,15 +1,15 @@
-"""The command line: trains every cell of a grid of environments, methods, lambdas and seeds, and writes a results folder.
+"""The command line: trains every combination of environments, methods, lambdas and seeds, and writes a results folder.
 
     python -m peps_jax.sweep --env nav-d1 nav-d4 --method peps sac --lam 2.0 2.4 2.8 --seeds 8 --out results/mine
     python -m peps_jax.sweep --resume --out results/mine
 
-Cells that share a structure run as one program over all devices; see `peps_jax.execution.batches`, and
+Runs that share a structure run as one program over all devices; see `peps_jax.execution.batches`, and
 `peps_jax.sweep.results` for what the folder holds. Every field of `Config` is a flag.
 Bad input gets one line on stderr and exit code 2 before anything compiles.
 Ctrl-C keeps the batches that are finished, with exit code 130; SIGTERM also makes a checkpoint of the one under way, with
 exit code 143. After either, or a kill, `--resume` continues, and gets the numbers of a sweep that was never stopped.
 A folder is one sweep's at a time: one from which `--resume` or `--overwrite` took it writes nothing more, says so in one line
-and ends with exit code 2. A sweep all of whose cells failed ends with exit code 1.
+and ends with exit code 2. A sweep all of whose runs failed ends with exit code 1.
 """
 
 from __future__ import annotations
@@ -88,12 +88,10 @@ class Training:
             self._sweep.save("interrupted")
         except ownership.OwnershipLostError:
             raise
-        except files.NotWrittenError:  # the cells' own files are there, and make them again
+        except files.NotWrittenError:  # the runs' own files are there, and make them again
             pass
         done = len(self._sweep.rows())  # of a process that doesn't lead: its own
-        kept = f"{done} of {len(self._wanted.cells)} cells are finished" + f" and kept in {self._wanted.out}" * (
-            done > 0
-        )
+        kept = f"{done} of {len(self._wanted.keys)} rows are finished" + f" and kept in {self._wanted.out}" * (done > 0)
         return f"{kept}; continue with: {self._wanted.continued}"
 
     def writing(self) -> contextlib.AbstractContextManager[None]:
@@ -124,8 +122,8 @@ class NothingToContinue:
         if journal.is_open(out):
             _clear_up(out)
         failed = results.all_failed(out)
-        cells = f"{len(self._wanted.cells)} cells"
-        print(f"{out} is complete: {cells}, nothing to continue" + ", and all of them failed" * failed)
+        rows = f"{len(self._wanted.keys)} rows"
+        print(f"{out} is complete: {rows}, nothing to continue" + ", and all of them failed" * failed)
         return 1 if failed else 0
 
     def kept(self) -> str:
@@ -153,13 +151,13 @@ def _tell(rows: Sequence[Row], wanted: Request, pictures: Sequence[str]) -> int:
     print_table(rows)
     failed = sum(row.run.failed for row in rows)
     if failed:
-        print(f"{failed} of {len(rows)} cells failed: something learned or evaluated is not finite")
+        print(f"{failed} of {len(rows)} rows failed: something learned or evaluated is not finite")
     print(
-        f"in {wanted.out}: {results.TABLE}, {results.CURVES}, {results.MANIFEST}, {results.CELLS}/, {', '.join(pictures)}"
+        f"in {wanted.out}: {results.TABLE}, {results.CURVES}, {results.MANIFEST}, {results.RUNS}/, {', '.join(pictures)}"
     )
     if failed == len(rows):
         return 1
-    print(f"go on with: peps_jax.load({str(wanted.out)!r}, {wanted.cells[0].name!r})")
+    print(f"go on with: peps_jax.load({str(wanted.out)!r}, {wanted.keys[0].name!r})")
     return 0
 
 

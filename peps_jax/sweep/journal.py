@@ -1,11 +1,11 @@
 """How far a sweep is: its plan, the batches that are done, and checkpoints of those under way; in its folder's `progress/`.
 
     plan.json                     what the sweep is about, its batches, and who runs which; sealed
-    batch-00003.json              batch 3 is done: the checksums of its cells' files, and what it took; sealed
+    batch-00003.json              batch 3 is done: the checksums of its runs' files, and what it took; sealed
     batch-00003/rounds-00000040/  a checkpoint of it, see `peps_jax.execution.checkpoints`
     process-00001.json            a sign of life, see `peps_jax.sweep.workers`
 
-A batch is done once its file is there: it comes last, after those of its cells. Tables and pictures can be made of these files
+A batch is done once its file is there: it comes last, after those of its runs. Tables and pictures can be made of these files
 at any time. The folder is removed when the sweep is complete.
 """
 
@@ -48,11 +48,11 @@ class Plan(NamedTuple):
 class Done(NamedTuple):
     """A batch that is done."""
 
-    cells: dict[str, str]  # checksums of the files, by training
+    runs: dict[str, str]  # checksums of the files, by training
     times: Times
 
 
-class Ledger:
+class Journal:
     """The progress of the sweep in `folder`.
 
     Args:
@@ -112,18 +112,18 @@ class Ledger:
         batches = tuple(Planned(tuple(one["trainings"]), one["slots"]) for one in stored["batches"])
         return Plan(batches, tuple(map(tuple, stored["shares"])), stored["run"])
 
-    def checkpoints(self, number: int, cells: Sequence[Config]) -> Checkpoints:
-        """The checkpoints of batch `number`, whose cells are `cells`."""
+    def checkpoints(self, number: int, runs: Sequence[Config]) -> Checkpoints:
+        """The checkpoints of batch `number`, whose runs are `runs`."""
         about = {name: value for name, value in self._about.items() if name != "format"}
-        return Checkpoints(self.folder / _name(number), about | {"cells": numbers_digest(cells)})
+        return Checkpoints(self.folder / _name(number), about | {"runs": numbers_digest(runs)})
 
-    def commit(self, number: int, cells: Mapping[str, FinishedRun], times: Times) -> None:
-        """Writes the cells' files, and then that batch `number` is done; it needs no checkpoint any more."""
+    def commit(self, number: int, runs: Mapping[str, FinishedRun], times: Times) -> None:
+        """Writes the runs' files, and then that batch `number` is done; it needs no checkpoint any more."""
         if self._keeps_answers:
-            for training, finished in cells.items():
+            for training, finished in runs.items():
                 results.write_answers(self._results, training, finished)
-        sums = {training: results.write_cell(self._results, training, finished) for training, finished in cells.items()}
-        content = {"cells": sums, "times": times._asdict()}
+        sums = {training: results.write_run(self._results, training, finished) for training, finished in runs.items()}
+        content = {"runs": sums, "times": times._asdict()}
         files.write_whole(self.folder / f"{_name(number)}.json", files.seal(files.json_bytes(content)))
         with contextlib.suppress(
             files.OwnershipLostError
@@ -140,7 +140,7 @@ class Ledger:
             stored = json.loads(files.unseal((self.folder / f"{_name(number)}.json").read_bytes()))
         except OSError:
             return None
-        return Done(stored["cells"], Times(**stored["times"]))
+        return Done(stored["runs"], Times(**stored["times"]))
 
 
 def is_open(folder: Path) -> bool:
@@ -160,9 +160,9 @@ def clear(folder: Path) -> None:
     files.remove(folder / FOLDER)
 
 
-def numbers_digest(cells: Sequence[Config], preferences: PreferenceSet | None = None) -> str:
-    """A checksum of all numbers that `cells` learn from, their environments' among them: a changed default is a changed one."""
-    leaves = jax.tree.leaves([[shared(cell) for cell in cells], preferences])
+def numbers_digest(configs: Sequence[Config], preferences: PreferenceSet | None = None) -> str:
+    """A checksum of all numbers that `configs` learn from, their environments' among them: a changed default is a changed one."""
+    leaves = jax.tree.leaves([[shared(config) for config in configs], preferences])
     return files.digest(b"".join(np.asarray(leaf).tobytes() for leaf in leaves))
 
 

@@ -42,12 +42,12 @@ def _values(rows: Sequence[Row], key: Callable[[Row], Any]) -> list[Any]:
 
 def _middle_lam(rows: Sequence[Row]) -> float:
     """One lambda stands for a grid of them where there is room for one: the middle of those that were swept."""
-    lams = sorted({row.cell.lam for row in rows})
+    lams = sorted({row.key.lam for row in rows})
     return lams[len(lams) // 2]
 
 
 def _of_method(rows: Sequence[Row], env: str, method: str, lam: float) -> list[Row]:
-    return [row for row in rows if (row.cell.env, row.cell.method, row.cell.lam) == (env, method, lam)]
+    return [row for row in rows if (row.key.env, row.key.method, row.key.lam) == (env, method, lam)]
 
 
 # --- curves ---------------------------------------------------------------------------------------------------------------
@@ -66,14 +66,14 @@ def learning_curves(rows: Sequence[Row]) -> Figure | None:
     rows = _good(rows)
     if not rows:
         return None
-    envs, lam = _values(rows, lambda row: row.cell.env), _middle_lam(rows)
+    envs, lam = _values(rows, lambda row: row.key.env), _middle_lam(rows)
     figure, panels = panels_of(2, len(envs), 3.6, 2.3)
     for column, env in enumerate(envs):
         for line, (curve, title) in enumerate((("return_", "return"), ("explicability", "explicability"))):
             axes = panels[line, column]
             tidy(axes)
             shown = []
-            for method in _values(rows, lambda row: row.cell.method):
+            for method in _values(rows, lambda row: row.key.method):
                 members = _of_method(rows, env, method, lam)
                 if members:
                     shown.append(_curve(axes, members, curve))
@@ -102,9 +102,9 @@ def _curve(axes: Axes, members: Sequence[Row], curve: str) -> np.ndarray:
     places = np.flatnonzero(np.isfinite(seeds).any(0))
     mean, low, high = (reduce(seeds[:, places], 0) for reduce in (np.nanmean, np.nanmin, np.nanmax))
     steps = (places + 1) * config.steps_per_round / 1000
-    colour = colour_of(members[0].cell.method)
+    colour = colour_of(members[0].key.method)
     axes.fill_between(steps, low, high, color=colour, alpha=0.16, linewidth=0)
-    axes.plot(steps, mean, color=colour, linewidth=1.8, label=_label(members[0].cell.method, members[0].cell.lam))
+    axes.plot(steps, mean, color=colour, linewidth=1.8, label=_label(members[0].key.method, members[0].key.lam))
     return mean[len(mean) // 5 :]
 
 
@@ -117,13 +117,13 @@ def frontier(rows: Sequence[Row]) -> Figure | None:
     rows = _good(rows)
     if not rows:
         return None
-    envs = _values(rows, lambda row: row.cell.env)
+    envs = _values(rows, lambda row: row.key.env)
     figure, panels = panels_of(1, len(envs), 3.6, 3.1)
     for axes, env in zip(panels[0], envs, strict=True):
         tidy(axes)
-        for method in _values(rows, lambda row: row.cell.method):
+        for method in _values(rows, lambda row: row.key.method):
             lams = _values(
-                [row for row in rows if (row.cell.env, row.cell.method) == (env, method)], lambda row: row.cell.lam
+                [row for row in rows if (row.key.env, row.key.method) == (env, method)], lambda row: row.key.lam
             )
             if not methods.get(method).uses_lam:
                 lams = lams[:1]  # all rows are the same trainings
@@ -151,7 +151,7 @@ def _frontier_line(axes: Axes, points: Sequence[Sequence[Row]], method: str) -> 
     )  # fmt: skip
     if methods.get(method).uses_lam:
         for members, place in zip(points, means, strict=True):
-            name = f"λ = {members[0].cell.lam:g}"
+            name = f"λ = {members[0].key.lam:g}"
             axes.annotate(name, place, (0, 7), textcoords="offset points", ha="center", fontsize=7, color=INK)
 
 
@@ -171,12 +171,12 @@ def routes(rows: Sequence[Row], episodes: int = 3) -> Figure | None:
     rows = _good(rows)
     if not rows:
         return None
-    variant = lambda row: (row.cell.method, row.cell.lam if methods.get(row.cell.method).uses_lam else None)
-    variants, envs = _values(rows, variant), _values(rows, lambda row: row.cell.env)
+    variant = lambda row: (row.key.method, row.key.lam if methods.get(row.key.method).uses_lam else None)
+    variants, envs = _values(rows, variant), _values(rows, lambda row: row.key.env)
     figure, panels = panels_of(len(envs), len(variants), 2.5, 2.5)
     for line, env in enumerate(envs):
         for column, (method, lam) in enumerate(variants):
-            members = {row.cell.training: row for row in rows if row.cell.env == env and variant(row) == (method, lam)}
+            members = {row.key.training: row for row in rows if row.key.env == env and variant(row) == (method, lam)}
             axes = panels[line, column]
             if not members:
                 axes.set_axis_off()
@@ -210,7 +210,7 @@ def _routes_panel(axes: Axes, members: Sequence[Row], episodes: int) -> None:
     for row in members:
         evaluation = row.run.evaluation
         for route, length in zip(evaluation.perceived[:episodes], evaluation.length[:episodes], strict=True):
-            draw_route(axes, route[: int(length) + 1], row.cell.method, _opacity(members))
+            draw_route(axes, route[: int(length) + 1], row.key.method, _opacity(members))
     draw_start(axes, members[0].run.training.problem.params)
 
 
@@ -270,7 +270,7 @@ def _perceived_panel(axes: Axes, members: Sequence[Row], episodes: int) -> None:
         for perceived, length in zip(evaluation.perceived[:episodes], evaluation.length[:episodes], strict=True):
             seen = np.asarray(perceived[: int(length) + 1])
             for part, style in zip(((seen - seen[:1]) / width[None]).T, itertools.cycle(("-", "--", ":", "-."))):
-                colour = colour_of(row.cell.method)
+                colour = colour_of(row.key.method)
                 axes.plot(part, style, color=colour, linewidth=1.2, alpha=_opacity(members))
     axes.set_xlabel("step; perceived state, σ_p from its start", color=QUIET, fontsize=7)
 
@@ -283,8 +283,8 @@ def surrogate_maps(rows: Sequence[Row]) -> Figure | None:
     lam = _middle_lam(rows)
     first: dict[tuple[str, str], Row] = {}
     for row in rows:
-        if row.cell.lam == lam:
-            first.setdefault((row.cell.env, row.cell.method), row)
+        if row.key.lam == lam:
+            first.setdefault((row.key.env, row.key.method), row)
     figure, panels = panels_of(len(first), 2, 3.3, 2.75)
     for line, ((env, method), row) in enumerate(first.items()):
         learned, true, free = surrogate_values(row.run)
@@ -294,7 +294,7 @@ def surrogate_maps(rows: Sequence[Row]) -> Figure | None:
         for axes, values, title in zip(panels[line], (learned, true), titles, strict=True):
             draw_heat(figure, axes, np.where(free, values, np.nan), params)
             axes.set_title(title, color=INK, fontsize=9)
-        panels[line, 0].set_ylabel(f"{env}, {method}, seed {row.cell.seed}", color=INK, fontsize=9)
+        panels[line, 0].set_ylabel(f"{env}, {method}, seed {row.key.seed}", color=INK, fontsize=9)
     return figure
 
 

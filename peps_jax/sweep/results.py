@@ -1,10 +1,10 @@
-"""A sweep's results folder: written batch by batch, each file whole or not at all, and read back cell by cell.
+"""A sweep's results folder: written batch by batch, each file whole or not at all, and read back run by run.
 
-    manifest.json    command, settings, versions, devices, times, cells
-    results.csv      one row for each cell of the grid
-    curves.npz       `env_steps` (rounds,), and every curve (cells, rounds) in the order of the rows; nan where a method has none
+    manifest.json    command, settings, versions, devices, times, rows
+    results.csv      a row for each combination of environment, method, lambda and seed
+    curves.npz       `env_steps` (rounds,), and every curve (rows, rounds) in the order of the rows; nan where a method has none
     answers/*.npz    what each training's teacher said, where that was asked for; see `peps_jax.preferences.data`
-    cells/*.msgpack  what each training learned and how it was evaluated, behind a line with the file's checksum
+    runs/*.msgpack   what each training learned and how it was evaluated, behind a line with the file's checksum
     *.png            pictures, see `peps_jax.sweep.pictures`
     progress/        how far an unfinished sweep is, see `peps_jax.sweep.journal`
     .owner/          whose the folder is while it is written, see `peps_jax.storage.ownership`
@@ -39,13 +39,13 @@ from peps_jax.storage import files
 from peps_jax.storage.tables import csv_bytes
 from peps_jax.train import Result, init, prepare
 
-MANIFEST, TABLE, CURVES, CELLS, ANSWERS = "manifest.json", "results.csv", "curves.npz", "cells", "answers"
+MANIFEST, TABLE, CURVES, RUNS, ANSWERS = "manifest.json", "results.csv", "curves.npz", "runs", "answers"
 PICTURES = ("learning_curves.png", "frontier.png", "routes.png", "surrogate.png")
-KEYS = ("env", "method", "lam", "seed")  # what tells a grid's cells apart
+KEYS = ("env", "method", "lam", "seed")  # what tells rows apart
 
 
-class Cell(NamedTuple):
-    """A row of the grid, and the training that it shows."""
+class Key(NamedTuple):
+    """What a row of the table shows."""
 
     env: str
     method: str
@@ -59,13 +59,13 @@ class Cell(NamedTuple):
 
     @property
     def file(self) -> str:
-        return f"{CELLS}/{self.training}.msgpack"
+        return f"{RUNS}/{self.training}.msgpack"
 
 
 class Row(NamedTuple):
-    """A finished cell."""
+    """A row of the table, and the run that it shows."""
 
-    cell: Cell
+    key: Key
     run: FinishedRun
 
 
@@ -92,7 +92,7 @@ def is_complete(folder: Path) -> bool:
 
 
 def all_failed(folder: Path) -> bool:
-    """Whether no cell of the sweep in `folder` has numbers that are finite."""
+    """Whether no row of the sweep in `folder` has numbers that are finite."""
     try:
         table = (folder / TABLE).read_text(encoding="utf-8")
     except OSError:
@@ -118,13 +118,13 @@ def summary(evaluation: Evaluation) -> dict[str, float]:
 
 def record(row: Row) -> dict[str, Any]:
     """A row of the table."""
-    cell = row.cell
+    key = row.key
     status = "failed" if row.run.failed else "ok"
     return (
-        {key: getattr(cell, key) for key in KEYS}
+        {name: getattr(key, name) for name in KEYS}
         | {"status": status}
         | summary(row.run.evaluation)
-        | {"cell": cell.name}
+        | {"name": key.name}
     )
 
 
@@ -138,9 +138,9 @@ def write_answers(folder: Path, training: str, run: FinishedRun) -> None:
         data.save(folder / ANSWERS / f"{training}.npz", run.preferences)
 
 
-def write_cell(folder: Path, training: str, run: FinishedRun) -> str:
+def write_run(folder: Path, training: str, run: FinishedRun) -> str:
     """Writes what a training left; returns the file's checksum. Raises NotWrittenError."""
-    path = folder / CELLS / f"{training}.msgpack"
+    path = folder / RUNS / f"{training}.msgpack"
     files.make_folder(path.parent)
     content = files.seal(_learned(run))
     files.write_whole(path, content)
@@ -148,7 +148,7 @@ def write_cell(folder: Path, training: str, run: FinishedRun) -> str:
 
 
 class Writer:
-    """Writes what a sweep's folder tells of its finished cells. `save` may come at any time; the folder is valid after each.
+    """Writes what a sweep's folder tells of its finished runs. `save` may come at any time; the folder is valid after each.
 
     Raises:
       NotWrittenError: there is no room, or no permission.
@@ -171,7 +171,7 @@ class Writer:
             "evaluation_seconds": round(times.evaluate, 3),
             "env_steps": env_steps,
             "env_steps_per_second": round(env_steps / times.run, 1) if times.run else 0.0,
-            "cells": [_entry(row) for row in rows],
+            "rows": [_entry(row) for row in rows],
         }
         files.write_whole(self.folder / MANIFEST, files.json_bytes(manifest))
 
@@ -180,14 +180,14 @@ def clear(folder: Path) -> None:
     """Removes a sweep's files; others stay. The manifest goes first: without it nothing is taken for results."""
     for name in (MANIFEST, TABLE, CURVES, *PICTURES):
         files.remove(folder / name)
-    for path in (*(folder / CELLS).glob("*.msgpack"), *(folder / ANSWERS).glob("*.npz")):
+    for path in (*(folder / RUNS).glob("*.msgpack"), *(folder / ANSWERS).glob("*.npz")):
         files.remove(path)
 
 
 def _entry(row: Row) -> dict[str, Any]:
-    """A cell's place in the manifest."""
-    cell = row.cell
-    return {"name": cell.name} | {key: getattr(cell, key) for key in KEYS} | {"file": cell.file}
+    """A row in the manifest."""
+    key = row.key
+    return {"name": key.name} | {name: getattr(key, name) for name in KEYS} | {"file": key.file}
 
 
 def _learned(run: FinishedRun) -> bytes:
@@ -205,14 +205,14 @@ def _learned(run: FinishedRun) -> bytes:
     return flax.serialization.to_bytes(jax.tree.map(np.asarray, parts))
 
 
-def read_cell(folder: Path, training: str, config: Config, num_episodes: int, checksum: str) -> FinishedRun:
-    """What `write_cell` was given.
+def read_run(folder: Path, training: str, config: Config, num_episodes: int, checksum: str) -> FinishedRun:
+    """What `write_run` was given.
 
     Raises:
       DamagedError: the file isn't the one with that checksum.
     """
     try:
-        content = (folder / CELLS / f"{training}.msgpack").read_bytes()
+        content = (folder / RUNS / f"{training}.msgpack").read_bytes()
     except OSError:
         raise files.DamagedError("it is missing") from None
     if files.digest(content) != checksum:
@@ -245,24 +245,24 @@ def _curves(rows: Sequence[Row]) -> bytes:
 # --- reading --------------------------------------------------------------------------------------------------------------
 
 
-def load(folder: str | os.PathLike[str], cell: int | str | Mapping[str, Any]) -> Result:
-    """A cell of a sweep, ready to act: `load("results/sweep", "nav-d1-peps-lam2.4-seed0").act(observation)`.
+def load(folder: str | os.PathLike[str], row: int | str | Mapping[str, Any]) -> Result:
+    """A row of a sweep, ready to act: `load("results/sweep", "nav-d1-peps-lam2.4-seed0").act(observation)`.
 
     Args:
       folder: that the sweep wrote.
-      cell: its row in results.csv, from 0; or its name, the column `cell`; or what tells it apart, e.g. {"env": "nav-d1",
+      row: its number in results.csv, from 0; or its name, the column `name`; or what tells it apart, e.g. {"env": "nav-d1",
         "method": "peps", "seed": 0}.
 
     Raises:
-      ValueError: no results there, no such cell, more than one, or a file that this version can't read.
+      ValueError: no results there, no such row, more than one, or a file that this version can't read.
     """
     folder = Path(folder)
     try:
         manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        cells, configuration = manifest["cells"], manifest["configuration"]
+        rows, configuration = manifest["rows"], manifest["configuration"]
     except (OSError, ValueError, KeyError):
         raise ValueError(f"folder {str(folder)!r} holds no sweep's results: {MANIFEST} is missing or broken") from None
-    entry = _find(cells, cell)
+    entry = _find(rows, row)
     config = _config(configuration, entry)
     problem = config.problem()
     shapes = jax.eval_shape(lambda config: init(prepare(config)), config)
@@ -287,31 +287,31 @@ def load(folder: str | os.PathLike[str], cell: int | str | Mapping[str, Any]) ->
     return Result(prepare(config), parts["agents"], parts["knowledge"], preferences, curves)
 
 
-def _find(cells: Sequence[Mapping[str, Any]], wanted: int | str | Mapping[str, Any]) -> Mapping[str, Any]:
-    """The manifest's entry of a cell."""
+def _find(rows: Sequence[Mapping[str, Any]], wanted: int | str | Mapping[str, Any]) -> Mapping[str, Any]:
+    """The manifest's entry of a row."""
     if isinstance(wanted, Mapping):
         for key in wanted:
             if key not in KEYS:
                 raise ValueError(unknown_name("key", key, KEYS))
-        found = [entry for entry in cells if all(entry[key] == value for key, value in wanted.items())]
+        found = [entry for entry in rows if all(entry[key] == value for key, value in wanted.items())]
         if len(found) != 1:
-            told = ", ".join(entry["name"] for entry in (found or cells)[:4])
-            more = " ..." if len(found or cells) > 4 else ""
-            raise ValueError(f"cell {dict(wanted)!r} matches {len(found)} of {len(cells)} cells, not one: {told}{more}")
+            told = ", ".join(entry["name"] for entry in (found or rows)[:4])
+            more = " ..." if len(found or rows) > 4 else ""
+            raise ValueError(f"row {dict(wanted)!r} matches {len(found)} of {len(rows)} rows, not one: {told}{more}")
         return found[0]
     if isinstance(wanted, str):
-        by_name = {entry["name"]: entry for entry in cells}
+        by_name = {entry["name"]: entry for entry in rows}
         if wanted not in by_name:
             nearest = difflib.get_close_matches(wanted, by_name, n=3, cutoff=0)
-            raise ValueError(f"cell {wanted!r} is unknown: of {len(cells)} cells the nearest are {', '.join(nearest)}")
+            raise ValueError(f"row {wanted!r} is unknown: of {len(rows)} rows the nearest are {', '.join(nearest)}")
         return by_name[wanted]
-    if not 0 <= wanted < len(cells):
-        raise ValueError(f"cell {wanted} is out of range: choose 0 to {len(cells) - 1}")
-    return cells[wanted]
+    if not 0 <= wanted < len(rows):
+        raise ValueError(f"row {wanted} is out of range: choose 0 to {len(rows) - 1}")
+    return rows[wanted]
 
 
 def _config(configuration: Mapping[str, Any], entry: Mapping[str, Any]) -> Config:
-    """A cell's `Config`: the sweep's settings, and what is the cell's own."""
+    """A row's `Config`: the sweep's settings, and what is the row's own."""
     own = {key: value for key, value in entry.items() if key in KEYS}
     values = tuples({name: value for name, value in configuration.items() if name not in KEYS} | own)
     names = {

@@ -22,18 +22,18 @@ def print_table(rows: Sequence[Row]) -> None:
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
     for name in ("env", "method", "lambda"):
         table.add_column(name)
-    records_of = {row.cell.training: results.record(row) for row in rows}
+    records_of = {row.key.training: results.record(row) for row in rows}
     rates = list(dict.fromkeys(name for record in records_of.values() for name in record if name.endswith("_rate")))
     events = (name.removesuffix("_rate").replace("_", " ") for name in rates)
     for name in ("return", "explicability", *events, "seeds"):
         table.add_column(name, justify="right", no_wrap=True)
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
-        lam = f"{row.cell.lam:g}" if methods.get(row.cell.method).uses_lam else "any"
-        groups.setdefault((row.cell.env, row.cell.method, lam), []).append(row)
+        lam = f"{row.key.lam:g}" if methods.get(row.key.method).uses_lam else "any"
+        groups.setdefault((row.key.env, row.key.method, lam), []).append(row)
     for key, members in groups.items():
-        trainings = {row.cell.training: row for row in members}.values()
-        records = [records_of[row.cell.training] for row in trainings if not row.run.failed]
+        trainings = {row.key.training: row for row in members}.values()
+        records = [records_of[row.key.training] for row in trainings if not row.run.failed]
         failed = len(trainings) - len(records)
         seeds = f"{len(records)}" + (f", {failed} failed" if failed else "")
         figures = (_spread(records, name) for name in ("return_mean", "explicability_mean"))

@@ -44,7 +44,7 @@ class Sweep:
         self._configs = list(wanted.trainings.values())
         self._places = {name: place for place, name in enumerate(wanted.trainings)}
         self._writer = results.Writer(wanted.out, wanted.begun_by, wanted.settings)
-        self._ledger = journal.Ledger(wanted.out, _about(wanted), wanted.settings["keep_answers"])
+        self._journal = journal.Journal(wanted.out, _about(wanted), wanted.settings["keep_answers"])
         self._finished: dict[str, FinishedRun] = {}
         self._times, self._env_steps = Times(), 0
         self._tables = checkpoints.Rhythm(1.0)
@@ -90,7 +90,7 @@ class Sweep:
                     journal.clear(self._wanted.out)
                 shares = tuple(tuple(left[index :: self._team.count]) for index in range(self._team.count))
                 plan = plan._replace(shares=shares, run=self._team.run)
-                self._ledger.begin(plan)
+                self._journal.begin(plan)
                 self.save("running")
         except (Exception, KeyboardInterrupt):
             self.owner.release()
@@ -106,12 +106,12 @@ class Sweep:
         """The plan of the sweep to be continued. Raises ValueError if there is nothing to continue."""
         if results.is_complete(self._wanted.out):
             raise ValueError(f"out {str(self._wanted.out)!r} is complete: another process has just finished it")
-        return self._ledger.plan()
+        return self._journal.plan()
 
     def _planned(self) -> journal.Plan:
-        """A new sweep's plan. Raises OutOfMemoryError, a ValueError, if a cell doesn't fit."""
+        """A new sweep's plan. Raises OutOfMemoryError, a ValueError, if a run doesn't fit."""
         names = list(self._wanted.trainings)
-        named = lambda one: journal.Planned(tuple(names[place] for place in one.cells), one.slots)
+        named = lambda one: journal.Planned(tuple(names[place] for place in one.runs), one.slots)
         return journal.Plan(tuple(map(named, self._divided())), (), "")
 
     def _divided(self) -> list[batches.Batch]:
@@ -119,7 +119,7 @@ class Sweep:
         free = None  # measured
         if self._team.neighbours > 1 and not side_by_side(devices):
             free = memory.available_bytes(devices) // self._team.neighbours
-        most = batches.cells_soon_done(devices)
+        most = batches.runs_soon_done(devices)
         return batches.plan(self._configs, self._wanted.episodes, devices, free, most, self._team.count, self.recorded)
 
     def _shared_out(self) -> journal.Plan:
@@ -129,7 +129,7 @@ class Sweep:
         with Reminder(f"{self._team.name} waits for process 0 to share out the batches in {out!r}"):
             while time.monotonic() < end:
                 with contextlib.suppress(ValueError):
-                    plan = self._ledger.plan()
+                    plan = self._journal.plan()
                     if plan.run == self._team.run:
                         return plan
                 if self._wanted.resume and results.is_complete(self._wanted.out):
@@ -151,9 +151,9 @@ class Sweep:
     # what is finished
 
     def rows(self) -> list[Row]:
-        """The finished cells, in the grid's order."""
+        """The finished rows, in the grid's order."""
         finished = self._finished
-        return [Row(cell, finished[cell.training]) for cell in self._wanted.cells if cell.training in finished]
+        return [Row(key, finished[key.training]) for key in self._wanted.keys if key.training in finished]
 
     @property
     def complete(self) -> bool:
@@ -167,32 +167,32 @@ class Sweep:
 
     def keep(self, number: int, finished: Sequence[FinishedRun], times: Times) -> None:
         """Writes a batch that this process has finished."""
-        cells = dict(zip(self._plan.batches[number].trainings, finished, strict=True))
-        self._ledger.commit(number, cells, times)
+        runs = dict(zip(self._plan.batches[number].trainings, finished, strict=True))
+        self._journal.commit(number, runs, times)
         # tables and pictures show none of the preferences, which are most of what a run leaves
-        self._take({name: run.replace(preferences=None) for name, run in cells.items()}, times)
+        self._take({name: run.replace(preferences=None) for name, run in runs.items()}, times)
 
-    def _take(self, cells: Mapping[str, FinishedRun], times: Times) -> None:
-        self._finished |= cells
+    def _take(self, runs: Mapping[str, FinishedRun], times: Times) -> None:
+        self._finished |= runs
         self._times += times
-        self._env_steps += sum(env_steps(cell.config) for cell in cells.values())
+        self._env_steps += sum(env_steps(run.config) for run in runs.values())
         if self._tables.due():
             self.save("running")
 
     def _read(self, number: int, planned: journal.Planned) -> bool:
         """Takes in a batch that is done; whether it is. One that is damaged isn't."""
         try:
-            done = self._ledger.done(number)
+            done = self._journal.done(number)
             if done is None:
                 return False
-            read = lambda name: results.read_cell(
-                self._wanted.out, name, self._wanted.trainings[name], self._wanted.episodes, done.cells[name]
+            read = lambda name: results.read_run(
+                self._wanted.out, name, self._wanted.trainings[name], self._wanted.episodes, done.runs[name]
             )
-            cells = {name: read(name) for name in planned.trainings}
+            runs = {name: read(name) for name in planned.trainings}
         except files.DamagedError as error:
             print(f"a file of batch {number} is damaged ({error}): it is trained again", file=sys.stderr)
             return False
-        self._take(cells, done.times)
+        self._take(runs, done.times)
         return True
 
     # what runs
@@ -233,7 +233,7 @@ class Sweep:
                 time.sleep(0.2)
 
     def checkpoints(self, number: int) -> checkpoints.Checkpoints:
-        return self._ledger.checkpoints(number, [self._configs[place] for place in self.batches[number].cells])
+        return self._journal.checkpoints(number, [self._configs[place] for place in self.batches[number].runs])
 
     def close(self) -> None:
         """Tables are written and pictures drawn: nothing is left to continue, and the folder is nobody's."""
@@ -256,8 +256,8 @@ class Keeper(Display):
         if self._stop.is_set():
             raise StoppedError
         self._checkpoints = self._sweep.checkpoints(self._number_of[current])
-        first = self._configs[current.cells[0]]
-        progress = self._checkpoints.latest(empty_progress(first, len(current.cells), self._sweep.recorded))
+        first = self._configs[current.runs[0]]
+        progress = self._checkpoints.latest(empty_progress(first, len(current.runs), self._sweep.recorded))
         self.begin(current, progress.rounds if progress else 0)
         return progress
 
@@ -276,8 +276,8 @@ class Keeper(Display):
         if self._stop.is_set():
             raise StoppedError
 
-    def finished(self, current: batches.Batch, cells: Sequence[FinishedRun], times: Times) -> None:
-        self._sweep.keep(self._number_of[current], cells, times)
+    def finished(self, current: batches.Batch, runs: Sequence[FinishedRun], times: Times) -> None:
+        self._sweep.keep(self._number_of[current], runs, times)
 
 
 def _about(wanted: Request) -> dict[str, str]:

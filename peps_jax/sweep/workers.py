@@ -1,6 +1,6 @@
 """A sweep over several processes, on one machine or many, with one results folder that all of them see.
 
-Cells are independent, so they are divided between the processes, and not laid over one mesh of all devices: each process
+Runs are independent, so they are divided between the processes, and not laid over one mesh of all devices: each process
 trains its batches on its own devices, as if it were alone. No collective waits for another machine, machines may differ, and
 one that fails takes nothing with it. They come together once (`peps_jax.sweep.meeting`); after that they only share the folder,
 where each leaves signs of life, and every process is a plain JAX program.

@@ -154,7 +154,7 @@ def rows_of(config, name):
     run = untrained(config)
     evaluation = jax.jit(evaluate, static_argnames="num_episodes")(run, num_episodes=2)
     run = run.replace(evaluation=jax.tree.map(np.asarray, evaluation))
-    return [results.Row(results.Cell(name, config.method, 1.0, 0, "any"), run)]
+    return [results.Row(results.Key(name, config.method, 1.0, 0, "any"), run)]
 
 
 def test_an_environment_without_a_picture_shows_its_perceived_state_over_time(line):

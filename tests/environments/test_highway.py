@@ -16,8 +16,8 @@ from peps_envs.environment import event
 from peps_envs.highway import classic, collision, environment, simulation, vehicle
 from peps_envs.highway.vehicle import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, LANE_WIDTH, SLOWER, Control
 
-WORLD = highway.Highway()
-reset, step = jax.jit(WORLD.reset), jax.jit(WORLD.step)
+ROAD = highway.Highway()
+reset, step = jax.jit(ROAD.reset), jax.jit(ROAD.step)
 TASKS = {name: peps_envs.make(f"highway-{name}") for name in highway.DOMAINS}
 GRAVITY = vehicle.GRAVITY
 
@@ -87,16 +87,14 @@ def test_what_is_left_of_a_command_lies_in_the_friction_circle(slip, acceleratio
 def drive(seed, plan, params):
     """The ego's heading and speed in an episode's 8 steps, (8, 16) each, whether it crashed in them, and the road's mu (8,)."""
     key_reset, key_mu = jax.random.split(jax.random.key(seed))
-    state, _ = WORLD.reset(key_reset, params)
+    state, _ = ROAD.reset(key_reset, params)
     friction = params.physics.friction
     coefficients = friction.mean + friction.sd * jnp.clip(jax.random.normal(key_mu, (8,)), -2, 2)
 
     def step(state, move):
         action, mu = move
         before = state.vehicles
-        after, (trace, _) = simulation.advance(
-            WORLD.road, before, state.drivers, state.time, action, mu, params.physics
-        )
+        after, (trace, _) = simulation.advance(ROAD.road, before, state.drivers, state.time, action, mu, params.physics)
         join = lambda first, later: jnp.concatenate([first[None, 0], later[:, 0]])
         path = join(before.heading, trace.heading), join(before.speed, trace.speed), trace.crashed[:, 0].any()
         return state.replace(vehicles=after, time=state.time + 1), path
@@ -140,12 +138,12 @@ def episodes(keys, plan, params):
         def step(carry, move):
             state, alive = carry
             action, key = move
-            after = WORLD.step(key, state, action, params)
+            after = ROAD.step(key, state, action, params)
             return (after.state, alive & ~after.terminated), (after, alive)
 
-        start = (WORLD.reset(key_reset, params)[0], jnp.ones((), bool))
+        start = (ROAD.reset(key_reset, params)[0], jnp.ones((), bool))
         _, (steps, alive) = jax.lax.scan(step, start, (plan, jax.random.split(key_steps, len(plan))))
-        crashed = event(WORLD, steps.events, "crashed")
+        crashed = event(ROAD, steps.events, "crashed")
         return jnp.sum(steps.reward * alive), jnp.any(crashed & alive), steps
 
     return jax.vmap(episode)(keys)
@@ -201,12 +199,12 @@ def test_an_episode_ends_in_one_way_only(seed, plan, name):
     for leaf in jax.tree.leaves((steps.observation, steps.reward, steps.state.vehicles)):
         assert np.all(np.isfinite(leaf))
     assert not np.any(steps.truncated)
-    wrecked = event(WORLD, steps.events, "crashed")
+    wrecked = event(ROAD, steps.events, "crashed")
     np.testing.assert_array_equal(steps.terminated, wrecked | (np.arange(8) >= 7)[None])
     assert bool(crashed[0]) == bool(wrecked.any())
     if not crashed[0]:
         assert np.all((steps.reward >= 0) & (steps.reward <= 1))
-    sideways = np.asarray(event(WORLD, steps.events, "changed_lane")).sum()
+    sideways = np.asarray(event(ROAD, steps.events, "changed_lane")).sum()
     assert sideways == 0 or {LANE_LEFT, LANE_RIGHT} & set(plan.tolist())
 
 
@@ -215,7 +213,7 @@ def test_an_episode_ends_in_one_way_only(seed, plan, name):
 def test_observations_say_what_is_perceived(seed, plan):
     params = TASKS["rain"].params
     _, _, steps = episodes(jax.random.key(seed)[None], jnp.array(plan), params)
-    expected = jax.vmap(jax.vmap(WORLD.perceive))(steps.state)
+    expected = jax.vmap(jax.vmap(ROAD.perceive))(steps.state)
     seen = np.asarray(steps.observation)
     own, gap = seen[..., :2] * [environment.SPEED_SCALE, LANE_WIDTH], seen[..., environment.EGO_FEATURES]
     shown = np.stack([gap * environment.GAP_SCALE - vehicle.LENGTH, own[..., 1], own[..., 0]], -1)
@@ -225,7 +223,7 @@ def test_observations_say_what_is_perceived(seed, plan):
 def test_meta_actions_move_targets():
     params = highway.make_params()
     state, _ = reset(jax.random.key(0), params)
-    after = jax.jit(jax.vmap(lambda action: WORLD.advance(state, action, jnp.inf, params).vehicles))(jnp.arange(5))
+    after = jax.jit(jax.vmap(lambda action: ROAD.advance(state, action, jnp.inf, params).vehicles))(jnp.arange(5))
     np.testing.assert_array_equal(after.target_lane[:, 0], [0, 1, 1, 1, 1])
     np.testing.assert_array_equal(after.target_speed[:, 0], [25, 25, 25, 30, 20])
 
@@ -238,7 +236,7 @@ def rated(**changes):
     params = highway.make_params()
     state, _ = reset(jax.random.key(0), params)
     vehicles = state.vehicles.replace(**{name: jnp.asarray(value, jnp.float32) for name, value in changes.items()})
-    return jax.jit(WORLD.rate)(state, state.replace(vehicles=vehicles), params)
+    return jax.jit(ROAD.rate)(state, state.replace(vehicles=vehicles), params)
 
 
 def test_features_of_the_reward():
@@ -260,9 +258,9 @@ def test_the_reward_weighs_features_by_their_ratings():
     state, _ = reset(jax.random.key(0), params)
     vehicles = state.vehicles.replace(x=state.vehicles.x.at[0].add(15.0), y=jnp.array([3.0, 4.0]))
     after = state.replace(vehicles=vehicles)
-    assert WORLD.reward(state, IDLE, after, params) == pytest.approx(0.25 * 0.5 + 0.75 * 0.5, rel=1e-5)
+    assert ROAD.reward(state, IDLE, after, params) == pytest.approx(0.25 * 0.5 + 0.75 * 0.5, rel=1e-5)
     wreck = after.replace(vehicles=vehicles.replace(crashed=jnp.array([True, True])))
-    assert WORLD.reward(state, IDLE, wreck, params) == pytest.approx(0.5 - 10, rel=1e-5)
+    assert ROAD.reward(state, IDLE, wreck, params) == pytest.approx(0.5 - 10, rel=1e-5)
 
 
 def test_moving_sideways_costs_the_more_the_faster():
@@ -271,7 +269,7 @@ def test_moving_sideways_costs_the_more_the_faster():
     after = state.replace(vehicles=state.vehicles.replace(y=jnp.array([3.0, 4.0])))
     for speed in (0.0, 15.0, 25.0):
         before = state.replace(vehicles=state.vehicles.replace(speed=jnp.array([speed, 25.0])))
-        change = WORLD.reward(before, IDLE, after, params) - WORLD.reward(before, IDLE, after, highway.make_params())
+        change = ROAD.reward(before, IDLE, after, params) - ROAD.reward(before, IDLE, after, highway.make_params())
         assert change == pytest.approx(-(1 + 4 * (speed / 30) ** 2) / 4, rel=1e-4)
 
 
@@ -280,22 +278,22 @@ def test_moving_sideways_costs_the_more_the_faster():
 
 @jax.jit
 def distribution(state, action, params):
-    return WORLD.next_state_distribution(state, action, params)
+    return ROAD.next_state_distribution(state, action, params)
 
 
 @jax.jit
 def sampled(key, state, action, params):
     """20 000 perceived next states of the simulation, and as many of the distribution."""
     keys, keys_see = jax.random.split(key, (2, 20_000))
-    moved = jax.vmap(lambda key: WORLD.perceive(WORLD.step(key, state, action, params).state))(keys)
-    expected = WORLD.next_state_distribution(state, action, params)
+    moved = jax.vmap(lambda key: ROAD.perceive(ROAD.step(key, state, action, params).state))(keys)
+    expected = ROAD.next_state_distribution(state, action, params)
     seen = moved + params.perception_width[None] * jax.vmap(lambda key: jax.random.normal(key, (3,)))(keys_see)
     return moved, seen, jax.vmap(expected.sample)(keys)
 
 
 @jax.jit
 def log_probs(state, action, params, perceived):
-    return jax.vmap(WORLD.next_state_distribution(state, action, params).log_prob)(perceived)
+    return jax.vmap(ROAD.next_state_distribution(state, action, params).log_prob)(perceived)
 
 
 def after(name, *plan):
@@ -362,7 +360,7 @@ def test_relative_log_density_and_entropy(seed, plan, name, ahead, aside):
 def test_without_randomness_a_prediction_scores_zero(params):
     state, _ = reset(jax.random.key(0), params)
     for action in (LANE_LEFT, SLOWER):
-        moved = WORLD.perceive(step(jax.random.key(1), state, jnp.int32(action), params).state)
+        moved = ROAD.perceive(step(jax.random.key(1), state, jnp.int32(action), params).state)
         expected = distribution(state, jnp.int32(action), params)
         assert abs(expected.relative_log_prob(moved)) < 1e-5
         assert abs(expected.relative_entropy()) < 1e-5
@@ -421,13 +419,13 @@ def test_batches_of_states_and_of_beliefs():
 
 
 def test_traffic_in_the_other_lane():
-    world = highway.Highway(traffic=2, changes=True)
+    made = highway.Highway(traffic=2, changes=True)
     params = TASKS["rain"].params
-    state, observation = jax.jit(world.reset)(jax.random.key(0), params)
-    assert observation.shape == (world.observation_size,) == (18,)
+    state, observation = jax.jit(made.reset)(jax.random.key(0), params)
+    assert observation.shape == (made.observation_size,) == (18,)
     np.testing.assert_array_equal(state.vehicles.y, [4, 4, 0, 0])
     assert state.vehicles.x[2] < state.vehicles.x[0] < state.vehicles.x[3]
-    step = jax.jit(world.step)
+    step = jax.jit(made.step)
     for number in range(8):
         after = step(jax.random.key(number), state, jnp.int32(SLOWER), params)
         state = after.state
@@ -437,13 +435,13 @@ def test_traffic_in_the_other_lane():
 
 
 def test_highway_envs_own_observation_and_reward():
-    world, params = highway.ClassicHighway(), highway.make_params()
-    state, observation = jax.jit(world.reset)(jax.random.key(0), params)
-    assert observation.shape == (world.observation_size,)
+    made, params = highway.ClassicHighway(), highway.make_params()
+    state, observation = jax.jit(made.reset)(jax.random.key(0), params)
+    assert observation.shape == (made.observation_size,)
     ego, ahead = np.asarray(observation).reshape(classic.ROWS, classic.COLUMNS)[:2]
     perceived = [
-        ahead[1] * classic.SIGHT - vehicle.LENGTH, ego[2] * LANE_WIDTH * world.lanes, ego[3] * 2 * classic.MAX_SPEED
+        ahead[1] * classic.SIGHT - vehicle.LENGTH, ego[2] * LANE_WIDTH * made.lanes, ego[3] * 2 * classic.MAX_SPEED
     ]  # fmt: skip
-    np.testing.assert_allclose(perceived, world.perceive(state), atol=1e-3)
-    after = jax.jit(world.step)(jax.random.key(0), state, jnp.int32(FASTER), params)
+    np.testing.assert_allclose(perceived, made.perceive(state), atol=1e-3)
+    after = jax.jit(made.step)(jax.random.key(0), state, jnp.int32(FASTER), params)
     assert after.reward == pytest.approx((0.4 * min((after.state.vehicles.speed[0] - 20) / 10, 1) + 0.1 + 1) / 1.5)

@@ -103,12 +103,12 @@ import numpy as np
 from peps_jax import Config
 from peps_jax.execution import batches, program
 sizes = dict(total_steps=40, num_envs=4, rollout_length=10, warmup_steps=0, batch_size=8, hidden_sizes=(4,), updates_per_step=0.1)
-cells = [Config(method="sac", seed=seed, **sizes) for seed in range(2)]
-(planned,) = batches.plan(cells, 2)
+configs = [Config(method="sac", seed=seed, **sizes) for seed in range(2)]
+(planned,) = batches.plan(configs, 2)
 if sys.argv[1] == "known":
     program.Program._compile = None
-compiled, _ = program.program(cells[0], planned.slots, 2, planned.devices)
-finished, _ = compiled.run(cells)
+compiled, _ = program.program(configs[0], planned.slots, 2, planned.devices)
+finished, _ = compiled.run(configs)
 print([one.evaluation.return_.tolist() for one in finished], compiled.bytes_used)
 """
 

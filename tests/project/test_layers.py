@@ -47,6 +47,9 @@ LAYERS = (
     ("peps_jax.execution",),
     ("peps_jax.command_line",),
     ("peps_jax.sweep",),
+    ("peps_jax.reproduce.store",),
+    ("peps_jax.reproduce.summary", "peps_jax.reproduce.ways"),
+    ("peps_jax.reproduce.plan", "peps_jax.reproduce.driving"),
     ("peps_jax.reproduce",),
 )
 LAYER_OF = {room: layer for layer, rooms in enumerate(LAYERS) for room in rooms}

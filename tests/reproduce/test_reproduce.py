@@ -128,9 +128,9 @@ def test_a_record_comes_back_as_it_was(tmp_path, tiny):
     kept = Store(tmp_path, tiny, EPISODES, seeds=2)
     kept.open()
     record, recipe = made_up(3.0, failed=True), store.settings_of(tiny)
-    assert kept.load("cell", recipe) is None
-    kept.save("cell", recipe, record.arrays())
-    again = Record.of(kept.load("cell", recipe))
+    assert kept.load("one", recipe) is None
+    kept.save("one", recipe, record.arrays())
+    again = Record.of(kept.load("one", recipe))
     assert (again.failed, again.seconds) == (True, 1.0)
     np.testing.assert_array_equal(again.routes, record.routes)
     for part in ("mode", "sampled", "heat"):
@@ -138,16 +138,16 @@ def test_a_record_comes_back_as_it_was(tmp_path, tiny):
         for name, values in getattr(record, part).items():
             np.testing.assert_array_equal(getattr(again, part)[name], values)
     with pytest.raises(ValueError, match="made with other settings"):
-        kept.load("cell", store.settings_of(tiny.replace(seed=7)))
+        kept.load("one", store.settings_of(tiny.replace(seed=7)))
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 half a file"])
 def test_a_broken_file_is_said(content, tmp_path, tiny):
     kept = Store(tmp_path, tiny, EPISODES, seeds=2)
     kept.open()
-    (tmp_path / store.KEPT / "cell.npz").write_bytes(content)
+    (tmp_path / store.KEPT / "one.npz").write_bytes(content)
     with pytest.raises(ValueError, match="can't be read: remove it"):
-        kept.load("cell", {})
+        kept.load("one", {})
 
 
 # --- trainings ------------------------------------------------------------------------------------------------------------
@@ -328,7 +328,7 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
 @pytest.mark.slow
 def test_a_stopped_table_continues(tmp_path, capsys, tiny, monkeypatch):
     monkeypatch.setattr(plan, "PLANNER", {name: dict(points=1, resolution=13) for name in plan.PLANNER})
-    monkeypatch.setattr(batches, "CELLS_PER_DEVICE", 1)  # two batches
+    monkeypatch.setattr(batches, "RUNS_PER_DEVICE", 1)  # two batches
     monkeypatch.setattr(table1, "METHODS", ("peps", "sac"))
     monkeypatch.setattr(table1, "BASELINES", ("sac",))
     for module in (table1, figure1):
@@ -340,11 +340,11 @@ def test_a_stopped_table_continues(tmp_path, capsys, tiny, monkeypatch):
     for what in [*plans, *made.trainings("nav-d1", "sac")]:  # one method and one plan are enough to compile
         kept.save(what.name, what.recipe, made_up(80.0).arrays())
 
-    def interrupt_the_last(cell, *arguments):
-        asked.append(cell.method)
+    def interrupt_the_last(config, *arguments):
+        asked.append(config.method)
         if len(asked) == 2:
             raise KeyboardInterrupt
-        return compiled(cell, *arguments)
+        return compiled(config, *arguments)
 
     monkeypatch.setattr(batches, "program", interrupt_the_last)
     arguments = ["table1", "--seeds", seeds, "--out", tmp_path]

@@ -33,7 +33,7 @@ SIZES = [
     *("--updates-per-step", "0.1", "--hidden-sizes", "8", "--model-hidden-sizes", "8", "--ensemble-size", "3"),
     *("--episodes", "4", "--checkpoint-every", "0"),
 ]
-LINE = ["--env", "line", "--method", "sac", "--seeds", "4", "--total-steps", "160", *SIZES]  # two batches of two cells
+LINE = ["--env", "line", "--method", "sac", "--seeds", "4", "--total-steps", "160", *SIZES]  # two batches of two runs
 OTHER = [*LINE, "--seed", "10", "--seeds", "2", "--overwrite"]
 LOST = "this run has lost the folder"
 
@@ -225,10 +225,10 @@ def test_commands_write_through_files_alone():
 
 @pytest.fixture
 def line_task(line, monkeypatch):
-    """The line as an environment that command lines know, in batches of two cells, and a moment's drawing."""
+    """The line as an environment that command lines know, in batches of two runs, and a moment's drawing."""
     task = peps_envs.Task(line.env, line.params, {"noisy": line.belief, "true": line.params})
     monkeypatch.setitem(peps_envs.registry._TASKS, "line", lambda: task)
-    monkeypatch.setattr(batches, "CELLS_PER_DEVICE", 1)
+    monkeypatch.setattr(batches, "RUNS_PER_DEVICE", 1)
     monkeypatch.setattr(pictures, "draw", lambda rows, folder: [])
 
 
@@ -252,7 +252,7 @@ def at(patch, place: object, name: str, number: int, act) -> None:
 MOMENTS = {
     "in its first batch": (underway.Keeper, "advanced", 2),
     "as it makes a checkpoint": (files, "write_folder", 2),
-    "as it keeps a batch": (journal.Ledger, "commit", 1),
+    "as it keeps a batch": (journal.Journal, "commit", 1),
     "as it begins another batch": (underway.Keeper, "start", 2),
     "as it draws": (pictures, "draw", 1),
     "as it closes": (underway.Sweep, "close", 1),
@@ -409,7 +409,7 @@ def test_a_sweep_of_which_every_cell_failed_says_so_by_its_exit_code(
     monkeypatch.setattr(program, "_finite", fail)
     assert call(*LINE, "--out", tmp_path) == code
     printed = capsys.readouterr().out
-    assert f"{failing} of 4 cells failed" in printed
+    assert f"{failing} of 4 rows failed" in printed
     assert ("go on with" in printed) == (code == 0)
     assert results.is_complete(tmp_path)
     assert call("--resume", "--out", tmp_path) == code
@@ -471,7 +471,7 @@ def test_a_store_keeps_nothing_in_a_folder_that_it_has_lost(tmp_path, tiny):
     second.open()
     before = everything(tmp_path)
     with pytest.raises(OwnershipLostError):
-        first.save("cell", {}, {"routes": np.zeros((3, 2, 2))})
+        first.save("run", {}, {"routes": np.zeros((3, 2, 2))})
     with pytest.raises(OwnershipLostError), first.writing():
         files.write_whole(tmp_path / "table1.md", b"late")
     first.close()

@@ -24,7 +24,7 @@ SIZES = [
     *("--updates-per-step", "0.1", "--hidden-sizes", "8", "--model-hidden-sizes", "8", "--ensemble-size", "3"),
     *("--total-steps", "160", "--episodes", "4"),
 ]
-LINE = ["--env", "line", "--method", "sac", "--seeds", "8", *SIZES]  # four batches of two cells
+LINE = ["--env", "line", "--method", "sac", "--seeds", "8", *SIZES]  # four batches of two runs
 
 
 def call(*arguments: object) -> int:
@@ -36,7 +36,7 @@ def team(line, monkeypatch):
     """Threads in place of processes: whoever says which one it is has joined the others already."""
     task = peps_envs.Task(line.env, line.params, {"noisy": line.belief, "true": line.params})
     monkeypatch.setitem(peps_envs.registry._TASKS, "line", lambda: task)
-    monkeypatch.setattr(batches, "CELLS_PER_DEVICE", 1)
+    monkeypatch.setattr(batches, "RUNS_PER_DEVICE", 1)
     monkeypatch.setattr(pictures, "draw", lambda rows, folder: [])
     monkeypatch.setattr(workers, "SILENCE", 1.0)
     monkeypatch.setattr(workers, "BEAT", 0.1)
@@ -64,7 +64,7 @@ def run_together(folder: Path, indices: list[int], count: int, *flags: str) -> d
     return codes
 
 
-def test_processes_divide_the_cells(team, tmp_path):
+def test_processes_divide_the_runs(team, tmp_path):
     assert call(*LINE, "--out", tmp_path / "one") == 0
     assert run_together(tmp_path / "three", [0, 1, 2], 3, *LINE) == {0: 0, 1: 0, 2: 0}
     assert contents(tmp_path / "three") == contents(tmp_path / "one")
@@ -78,7 +78,7 @@ def test_a_process_that_never_comes_is_said_and_the_others_are_kept(team, tmp_pa
     assert run_together(folder, [0, 2], 3, *LINE) == {0: 1, 2: 0}
     error = capsys.readouterr().err
     assert "process 1 didn't finish: no sign of life" in error
-    assert f"6 of 8 cells are finished and kept in {folder}; continue with: " in error
+    assert f"6 of 8 rows are finished and kept in {folder}; continue with: " in error
     with open(folder / results.TABLE, newline="", encoding="utf-8") as file:
         assert len(list(csv.DictReader(file))) == 6
     assert json.loads((folder / results.MANIFEST).read_text(encoding="utf-8"))["status"] == "interrupted"
@@ -107,7 +107,7 @@ def test_a_process_that_fails_says_why_to_all(team, tmp_path, capsys, monkeypatc
         thread.join()
     assert codes == {0: 1}
     assert "process 1 didn't finish: failed: MemoryError: no room for this" in capsys.readouterr().err
-    assert len(list((folder / results.CELLS).iterdir())) == 4
+    assert len(list((folder / results.RUNS).iterdir())) == 4
 
 
 def test_process_0_that_fails_is_said_by_the_others(team, tmp_path, capsys, monkeypatch):
@@ -191,7 +191,7 @@ def test_two_processes_have_the_numbers_of_one(tmp_path):
     assert one.returncode == 0, error
     assert contents(tmp_path / "two") == contents(tmp_path / "one")
     with open(tmp_path / "two" / results.TABLE, newline="", encoding="utf-8") as file:
-        assert [int(row["seed"]) for row in csv.DictReader(file)] == list(range(8)), "every cell once"
+        assert [int(row["seed"]) for row in csv.DictReader(file)] == list(range(8)), "every run once"
 
 
 def test_life_and_death_are_told_apart(tmp_path, monkeypatch):

@@ -30,7 +30,7 @@ SIZES = [
     *("--updates-per-step", "0.1", "--hidden-sizes", "8", "--model-hidden-sizes", "8", "--ensemble-size", "3"),
     *("--episodes", "4", "--checkpoint-every", "0"),
 ]
-LINE = ["--env", "line", "--method", "sac", "--seeds", "4", "--total-steps", "160", *SIZES]  # two batches of two cells
+LINE = ["--env", "line", "--method", "sac", "--seeds", "4", "--total-steps", "160", *SIZES]  # two batches of two runs
 KILLS, CORRUPTIONS = 50, 24
 
 
@@ -67,10 +67,10 @@ DEATH = Death()
 
 @pytest.fixture(autouse=True)
 def line_task(line, monkeypatch):
-    """The line as an environment that command lines know, in batches of two cells, and a moment's drawing."""
+    """The line as an environment that command lines know, in batches of two runs, and a moment's drawing."""
     task = peps_envs.Task(line.env, line.params, {"noisy": line.belief, "true": line.params})
     monkeypatch.setitem(peps_envs.registry._TASKS, "line", lambda: task)
-    monkeypatch.setattr(batches, "CELLS_PER_DEVICE", 1)
+    monkeypatch.setattr(batches, "RUNS_PER_DEVICE", 1)
     monkeypatch.setattr(pictures, "draw", lambda rows, folder: [])
     yield
     DEATH.disarm()
@@ -90,7 +90,7 @@ def made(line, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         task = peps_envs.Task(line.env, line.params, {"noisy": line.belief, "true": line.params})
         patch.setitem(peps_envs.registry._TASKS, "line", lambda: task)
-        patch.setattr(batches, "CELLS_PER_DEVICE", 1)
+        patch.setattr(batches, "RUNS_PER_DEVICE", 1)
         patch.setattr(pictures, "draw", lambda rows, folder: [])
         folder = tmp_path_factory.mktemp("whole") / "out"
         assert call(*LINE, "--out", folder) == 0
@@ -135,11 +135,11 @@ def test_a_terminated_sweep_says_how_to_continue_and_does(whole, tmp_path, capsy
         assert call(*LINE, "--out", tmp_path) == 143
     error = capsys.readouterr().err
     assert (
-        f"2 of 4 cells are finished and kept in {tmp_path}; continue with: {command.PROG} --resume --out {tmp_path}"
+        f"2 of 4 rows are finished and kept in {tmp_path}; continue with: {command.PROG} --resume --out {tmp_path}"
         in error
     )
     assert status(tmp_path) == "interrupted"
-    assert contents(tmp_path)["cells/line-sac-seed0.msgpack"] == whole["cells/line-sac-seed0.msgpack"]
+    assert contents(tmp_path)["runs/line-sac-seed0.msgpack"] == whole["runs/line-sac-seed0.msgpack"]
     assert call("--resume", "--out", tmp_path) == 0
     assert "from round 2 on" in capsys.readouterr().err
     assert contents(tmp_path) == whole
@@ -174,10 +174,12 @@ def test_killed_anywhere_and_continued(whole, tmp_path, monkeypatch):
         advanced(self, *arguments)
         DEATH.tick()
 
-    def run_unfinished(self, cells, *arguments):
-        done = [json.loads(files.unseal(path.read_bytes()))["cells"] for path in folder.glob("progress/batch-*.json")]
-        assert not {f"line-sac-seed{cell.seed}" for cell in cells} & set().union(*done), "a finished cell runs again"
-        return run(self, cells, *arguments)
+    def run_unfinished(self, configs, *arguments):
+        done = [json.loads(files.unseal(path.read_bytes()))["runs"] for path in folder.glob("progress/batch-*.json")]
+        assert not {f"line-sac-seed{config.seed}" for config in configs} & set().union(*done), (
+            "a finished run runs again"
+        )
+        return run(self, configs, *arguments)
 
     monkeypatch.setattr(underway.Keeper, "advanced", hear)
     monkeypatch.setattr(program.Program, "run", run_unfinished)
@@ -260,10 +262,10 @@ def damage(path: Path, chance: random.Random) -> None:
 
 
 def test_a_damaged_checkpoint_gives_way_to_the_one_before(stopped, tmp_path, line, capsys):
-    cells = [line.replace(method="sac", seed=seed) for seed in (2, 3)]
-    empty = program.empty_progress(cells[0], 2)
+    configs = [line.replace(method="sac", seed=seed) for seed in (2, 3)]
+    empty = program.empty_progress(configs[0], 2)
     about = json.loads(files.unseal(next(stopped.glob("progress/*/rounds-*3/checkpoint.json")).read_bytes()))
-    about = {name: about[name] for name in ("peps-jax", "jax", "jaxlib", "devices", "configuration", "cells")}
+    about = {name: about[name] for name in ("peps-jax", "jax", "jaxlib", "devices", "configuration", "runs")}
     source = stopped / "progress" / "batch-00001"
     assert [path.name for path in sorted(source.iterdir())] == ["rounds-00000002", "rounds-00000003"]
     chance = random.Random(1)
@@ -289,7 +291,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before(stopped, tmp_path, lin
     [
         ("progress/batch-00001/rounds-00000003/arrays/**/*", "from round 2 on"),
         ("progress/batch-00001/*/checkpoint.json", "is damaged"),
-        ("cells/*.msgpack", "is trained again"),
+        ("runs/*.msgpack", "is trained again"),
         ("progress/batch-00000.json", "is trained again"),
     ],
 )
@@ -394,7 +396,7 @@ def change_manifest(folder: Path) -> None:
             lambda folder: rewrite(
                 next(folder.glob("progress/*/rounds-*3/checkpoint.json")), lambda head: head.update(format=7)
             ),
-            ("has format 7", "2 of 4 cells are finished"),
+            ("has format 7", "2 of 4 rows are finished"),
         ),
     ],
 )  # fmt: skip
@@ -473,7 +475,7 @@ def test_files_are_whole_or_not_there(tmp_path):
 
 def test_a_plan_belongs_to_what_it_was_made_for(tmp_path):
     plan = journal.Plan((journal.Planned(("a", "b"), 2),), ((0,), ()), "now")
-    journal.Ledger(tmp_path, {"jax": "1"}).begin(plan)
-    assert journal.Ledger(tmp_path, {"jax": "1"}).plan() == plan
+    journal.Journal(tmp_path, {"jax": "1"}).begin(plan)
+    assert journal.Journal(tmp_path, {"jax": "1"}).plan() == plan
     with pytest.raises(ValueError, match="was begun with jax 1, and this is 2"):
-        journal.Ledger(tmp_path, {"jax": "2"}).plan()
+        journal.Journal(tmp_path, {"jax": "2"}).plan()

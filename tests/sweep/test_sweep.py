@@ -1,4 +1,4 @@
-"""The sweep: what it refuses, what it writes, and that a cell in a batch is the cell alone."""
+"""The sweep: what it refuses, what it writes, and that a run in a batch is the run alone."""
 
 import csv
 import json
@@ -139,28 +139,28 @@ def test_importing_the_library_meets_no_device():
 
 def test_worlds_share_a_program_and_methods_do_not(tiny, monkeypatch):
     monkeypatch.setattr(batches, "memory_need", lambda *_: memory.Need(1000, 1000))
-    cells = [tiny.replace(env=env, method=method) for env in ("nav-d1", "nav-d3") for method in ("peps", "sac")]
-    planned = batches.plan(cells, EPISODES, free=10**9)
-    assert [one.cells for one in planned] == [(0, 2), (1, 3)]
+    configs = [tiny.replace(env=env, method=method) for env in ("nav-d1", "nav-d3") for method in ("peps", "sac")]
+    planned = batches.plan(configs, EPISODES, free=10**9)
+    assert [one.runs for one in planned] == [(0, 2), (1, 3)]
 
 
 def test_what_does_not_fit_is_split_into_batches_of_one_size(line):
-    cells = [line.replace(seed=seed) for seed in range(7)]
+    configs = [line.replace(seed=seed) for seed in range(7)]
     need = program.memory_need(line, EPISODES)
     two_per_device = int((memory.bytes_needed(need, 2, together=False) + 100) / memory.AVAILABLE_SHARE)
-    planned = batches.plan(cells, EPISODES, free=two_per_device)
+    planned = batches.plan(configs, EPISODES, free=two_per_device)
     assert [one.slots for one in planned] == [4, 4]
-    assert [place for one in planned for place in one.cells] == list(range(7))
+    assert [place for one in planned for place in one.runs] == list(range(7))
     with pytest.raises(memory.OutOfMemoryError, match="each of 2 devices"):
-        batches.plan(cells, EPISODES, free=need.working)
+        batches.plan(configs, EPISODES, free=need.working)
 
 
 def test_side_by_side_every_cell_needs_its_working_memory():
     need = memory.Need(state=100, working=1000)
     free = int(10_000 / memory.AVAILABLE_SHARE)
-    assert memory.cells_that_fit(need, free, together=False) == 44
-    assert memory.cells_that_fit(need, free, together=True) == 8
-    assert memory.cells_that_fit(need, 0, together=False) == 0
+    assert memory.runs_that_fit(need, free, together=False) == 44
+    assert memory.runs_that_fit(need, free, together=True) == 8
+    assert memory.runs_that_fit(need, 0, together=False) == 0
 
 
 def test_predicted_memory_grows_as_what_it_counts(line):
@@ -229,13 +229,13 @@ def test_a_sweep_writes_the_whole_grid(swept):
     assert [(row["method"], float(row["lam"]), int(row["seed"])) for row in rows] == [
         (method, lam, seed) for method in ("peps", "sac") for lam in (1.0, 2.4) for seed in (3, 4)
     ]
-    assert [row["cell"] for row in rows] == [cell["name"] for cell in manifest["cells"]]
+    assert [row["name"] for row in rows] == [row["name"] for row in manifest["rows"]]
     assert {row["status"] for row in rows} == {"ok"}
     for column in ("return_mean", "explicability_mean", "belief_gap_mean", "length_mean", "goal_rate", "pit_rate"):
         assert all(np.isfinite(float(row[column])) for row in rows), column
-    policies = [jax.tree.leaves(peps_jax.load(swept, cell).agents) for cell in (0, 2)]
+    policies = [jax.tree.leaves(peps_jax.load(swept, row).agents) for row in (0, 2)]
     assert not all(map(np.array_equal, *policies)), "lambda changes what PEPS learns"
-    sac = [{**row, "lam": "", "cell": ""} for row in rows if row["method"] == "sac"]
+    sac = [{**row, "lam": "", "name": ""} for row in rows if row["method"] == "sac"]
     assert sac[:2] == sac[2:], "and nothing of what SAC does"
 
     assert manifest["status"] == "complete"
@@ -288,7 +288,7 @@ def test_every_method_is_swept_and_loaded(line, line_task, tmp_path):
     assert call([*flags, *tiny_flags(line), "--out", str(tmp_path)]) == 0
     rows = table(tmp_path)
     assert [(row["method"], row["status"]) for row in rows] == [(name, "ok") for name in names for _ in range(2)]
-    assert len(list((tmp_path / results.CELLS).iterdir())) == 3, "none of them uses lambda"
+    assert len(list((tmp_path / results.RUNS).iterdir())) == 3, "none of them uses lambda"
     curves = np.load(tmp_path / results.CURVES)
     assert np.isfinite(curves["surrogate_decay"][:2]).all()
     assert np.isnan(curves["surrogate_decay"][2:]).all(), "only drlhp adapts its weight decay"
@@ -303,25 +303,25 @@ def test_every_method_with_a_surrogate_reward_has_its_heat_map(tiny):
     rows = []
     for method in ("peps", "sac", "drlhp"):
         config = tiny.replace(method=method)
-        rows += [results.Row(results.Cell("nav-d1", method, 2.4, seed, "any"), untrained(config)) for seed in (0, 1)]
+        rows += [results.Row(results.Key("nav-d1", method, 2.4, seed, "any"), untrained(config)) for seed in (0, 1)]
     titles = [axes.get_ylabel() for axes in pictures.surrogate_maps(rows).axes]
     assert [title for title in titles if title.startswith("nav")] == ["nav-d1, peps, seed 0", "nav-d1, drlhp, seed 0"]
 
 
 @pytest.mark.parametrize(
-    ("cell", "message"),
+    ("row", "message"),
     [
-        (8, "cell 8 is out of range: choose 0 to 7"),
+        (8, "row 8 is out of range: choose 0 to 7"),
         (-1, "choose 0 to 7"),
         ("nav-d1-peps-lam2.4-seed5", "the nearest are .*nav-d1-peps-lam2.4-seed"),
-        ({"method": "sac"}, "matches 4 of 8 cells"),
-        ({"method": "sac", "seed": 9}, "matches 0 of 8 cells"),
+        ({"method": "sac"}, "matches 4 of 8 rows"),
+        ({"method": "sac", "seed": 9}, "matches 0 of 8 rows"),
         ({"sead": 3}, "did you mean 'seed'"),
     ],
 )
-def test_a_cell_that_is_not_there(swept, cell, message):
+def test_a_row_that_is_not_there(swept, row, message):
     with pytest.raises(ValueError, match=message):
-        peps_jax.load(swept, cell)
+        peps_jax.load(swept, row)
 
 
 def test_a_folder_without_results_is_said(tmp_path):
@@ -344,8 +344,8 @@ def test_an_interrupted_sweep_keeps_what_is_finished(line, line_task, tmp_path, 
     monkeypatch.setattr(batches, "program", interrupt_the_second)
     flags = ["--env", "line", "--method", "sac", "peps", "--lam", "1.0", "2.4", "--seeds", "2", "--overwrite"]
     assert call([*flags, *tiny_flags(line), "--out", str(tmp_path)]) == 130
-    assert f"4 of 8 cells are finished and kept in {tmp_path}" in capsys.readouterr().err
-    assert [row["cell"] for row in table(tmp_path)] == [
+    assert f"4 of 8 rows are finished and kept in {tmp_path}" in capsys.readouterr().err
+    assert [row["name"] for row in table(tmp_path)] == [
         f"line-sac-lam{lam}-seed{seed}" for lam in (1.0, 2.4) for seed in (0, 1)
     ]
     assert json.loads((tmp_path / results.MANIFEST).read_text(encoding="utf-8"))["status"] == "interrupted"
@@ -356,27 +356,27 @@ def test_an_interrupted_sweep_keeps_what_is_finished(line, line_task, tmp_path, 
 
 @pytest.mark.slow
 def test_a_cell_alone_in_a_split_batch_and_beside_a_failing_one(line, train):
-    cells = [line.replace(method="peps", seed=seed) for seed in (3, 4, 5)]
-    cells[1] = cells[1].replace(learning_rate=float("nan"))
-    need = program.memory_need(cells[0], EPISODES)
+    configs = [line.replace(method="peps", seed=seed) for seed in (3, 4, 5)]
+    configs[1] = configs[1].replace(learning_rate=float("nan"))
+    need = program.memory_need(configs[0], EPISODES)
     one_per_device = int((memory.bytes_needed(need, 1, together=False) + 100) / memory.AVAILABLE_SHARE)
-    planned = batches.plan(cells, EPISODES, free=one_per_device)
-    assert [one.cells for one in planned] == [(0, 1), (2,)]
+    planned = batches.plan(configs, EPISODES, free=one_per_device)
+    assert [one.runs for one in planned] == [(0, 1), (2,)]
     reported, finished = [], []
 
     class Listener(batches.Watch):
         def advanced(self, batch, rounds, curves, snapshot):
             reported.append(rounds)
 
-        def finished(self, batch, cells, times):
-            finished.extend(cells)
+        def finished(self, batch, runs, times):
+            finished.extend(runs)
             assert times.run > 0
 
-    batches.run(cells, planned, EPISODES, Listener())
-    assert [cell.failed for cell in finished] == [False, True, False]
+    batches.run(configs, planned, EPISODES, Listener())
+    assert [run.failed for run in finished] == [False, True, False]
     assert reported == [1, 2, 3, 4] * 2
 
-    alone = train(cells[2])
+    alone = train(configs[2])
     for name, curve in alone.curves.items():
         np.testing.assert_allclose(finished[2].curves[name], curve, rtol=1e-3, atol=1e-4, err_msg=name)
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
@@ -392,7 +392,7 @@ def test_a_failed_cell_is_a_row_that_says_so(line):
         perceived=np.zeros((2, 3, 2)),
     )
     failed = untrained(line).replace(evaluation=evaluation, failed=True)
-    record = results.record(results.Row(results.Cell("nav-d1", "peps", 2.4, 0, training="x"), failed))
+    record = results.record(results.Row(results.Key("nav-d1", "peps", 2.4, 0, training="x"), failed))
     assert record["status"] == "failed"
     assert record["goal_rate"] == 0.5
     assert np.isnan(record["return_mean"])

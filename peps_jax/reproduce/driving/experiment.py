@@ -109,12 +109,12 @@ class Part(NamedTuple):
     def make(self, num_episodes: int = 0) -> Seen:
         """Trains and watches its agents over all devices: numpy arrays, (lams, seeds, ...)."""
         del num_episodes  # the driving study has its own
-        program, cells = compile_over_devices(
+        program, configs = compile_over_devices(
             lambda config: learn(config, self.episodes), list(map(shared, self.configs))
         )
         number, shape = len(self.configs), (len(self.lams), len(self.seeds))
         shaped = lambda rows: np.asarray(rows)[:number].reshape(*shape, *rows.shape[1:])
-        return jax.tree.map(shaped, program(cells))
+        return jax.tree.map(shaped, program(configs))
 
 
 def _recipe(config: Config) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The roof: how fast this machine multiplies matrices of the shapes that SAC multiplies, on all devices at once.
+"""The roofline: how fast this machine multiplies matrices of the shapes that SAC multiplies, on all devices at once.
 
 An update of SAC, for observations of o and actions of a components, two layers of w units and a minibatch of b, multiplies
 

@@ -1,4 +1,4 @@
-"""The NumPy world as Stable-Baselines3 wants it; for the same 16 worlds its `DummyVecEnv` would call each by itself."""
+"""The NumPy environment as Stable-Baselines3 wants it; for the same 16 environments its `DummyVecEnv` would call each by itself."""
 
 from typing import Any
 
@@ -8,20 +8,20 @@ from stable_baselines3.common.vec_env import VecEnv
 
 
 class NavigationVecEnv(VecEnv):
-    """`count` worlds side by side."""
+    """`count` environments side by side."""
 
     def __init__(self, count: int):
         super().__init__(count, Navigation.observation_space, Navigation.action_space)
-        self._worlds, self._actions = ManyNavigations(count), None
+        self._environments, self._actions = ManyNavigations(count), None
 
     def reset(self) -> np.ndarray:
-        return self._worlds.reset()
+        return self._environments.reset()
 
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict]]:
-        reached, following, rewards, terminated, truncated = self._worlds.step(self._actions)
+        reached, following, rewards, terminated, truncated = self._environments.step(self._actions)
         over, infos = terminated | truncated, [{} for _ in range(self.num_envs)]
         for place in np.flatnonzero(over):
             infos[place] = {"terminal_observation": reached[place], "TimeLimit.truncated": bool(truncated[place])}

@@ -1,4 +1,4 @@
-"""Worlds alone: random actions, a new start after an episode's end, on all cores."""
+"""Environments alone: random actions, a new start after an episode's end, on all cores."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import peps_envs
 
 NAVIGATION = ("nav-d1", "nav-d2", "nav-d3", "nav-d4")
 HIGHWAY = "highway-rain"
-TOLERANCE = 1e-5  # between the NumPy world and the JAX one, which has 32-bit floats
+TOLERANCE = 1e-5  # between the NumPy environment and the JAX one, which has 32-bit floats
 SCENE = {  # of highway-env: `highway-rain`'s
     "lanes": 2, "sim_hz": 15, "policy_hz": 1, "target_speeds": [5.0 * step for step in range(7)],
     "vehicles": [
@@ -33,7 +33,7 @@ def random_action(space: peps_envs.ActionSpace, key: jax.Array) -> jax.Array:
 
 
 def ours(names: tuple[str, ...], batch: int, steps: int) -> dict[str, dict[str, float]]:
-    """Steps a second of `batch` worlds on each device, for worlds that share one program."""
+    """Steps a second of `batch` environments on each device, for environments that share one program."""
     tasks = [peps_envs.make(name) for name in names]
     environment = tasks[0].environment
 
@@ -63,7 +63,7 @@ def ours(names: tuple[str, ...], batch: int, steps: int) -> dict[str, dict[str, 
 
 
 def transitions_of_d1(number: int) -> dict[str, list]:
-    """Deterministic steps of D1 from everywhere, as the JAX world makes them."""
+    """Deterministic steps of D1 from everywhere, as the JAX environment makes them."""
     task = peps_envs.make("nav-d1")
     key_place, key_action, key_step = jax.random.split(jax.random.key(0), 3)
     start, _ = task.environment.reset(key_step, task.params)
@@ -77,16 +77,16 @@ def transitions_of_d1(number: int) -> dict[str, list]:
 
 
 def difference() -> float:
-    """The largest one between the NumPy world's steps and the JAX world's.
+    """The largest one between the NumPy environment's steps and the JAX environment's.
 
     Raises:
-      ValueError: they are not the same world.
+      ValueError: they are not the same environment.
     """
     found = json.loads(
         _with_file(transitions_of_d1(500), lambda path: peer.call("sb3", "numpy_navigation.py", "check", path))
     )
     if not found["difference"] < TOLERANCE:
-        raise ValueError(f"the NumPy world differs from nav-d1 by {found['difference']}: bring it up to date")
+        raise ValueError(f"the NumPy environment differs from nav-d1 by {found['difference']}: bring it up to date")
     return found["difference"]
 
 
@@ -98,7 +98,7 @@ def _with_file(content: Any, use: Any) -> Any:
 
 
 def measure(quick: bool) -> dict[str, Any]:
-    """Rates of every world, ours and others'; `missing` says why one isn't there."""
+    """Rates of every environment, ours and others'; `missing` says why one isn't there."""
     rates = ours(NAVIGATION, *((64, 20) if quick else (1_024, 1_000)))
     rates |= ours((HIGHWAY,), *((8, 10) if quick else (256, 400)))
     cores, seconds = len(peer.CORES), 0.5 if quick else 4.0
@@ -110,12 +110,12 @@ def measure(quick: bool) -> dict[str, Any]:
     )
     try:
         record["difference"] = difference()
-        others["NumPy, a thousand at a time"] = {"rate": numpy(1_000).rate, "world": "nav-d1"}
-        others["Gymnasium and NumPy"] = {"rate": numpy(1).rate, "world": "nav-d1"}
+        others["NumPy, a thousand at a time"] = {"rate": numpy(1_000).rate, "environment": "nav-d1"}
+        others["Gymnasium and NumPy"] = {"rate": numpy(1).rate, "environment": "nav-d1"}
     except peer.Missing as error:
-        others["Gymnasium and NumPy"] = {"missing": str(error), "world": "nav-d1"}
+        others["Gymnasium and NumPy"] = {"missing": str(error), "environment": "nav-d1"}
     try:
-        others["highway-env 1.12.1"] = {"rate": scene().rate, "world": HIGHWAY}
+        others["highway-env 1.12.1"] = {"rate": scene().rate, "environment": HIGHWAY}
     except peer.Missing as error:
-        others["highway-env 1.12.1"] = {"missing": str(error), "world": HIGHWAY}
+        others["highway-env 1.12.1"] = {"missing": str(error), "environment": HIGHWAY}
     return record
