@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +14,8 @@ from jax import Array
 from peps_jax import explicability
 from peps_jax.config import Problem
 from peps_jax.explicability import Score
-from peps_jax.train import Result
+from peps_jax.settings import AgentSettings
+from peps_jax.train import Result, policy_of
 
 Policy = Callable[[Array, Array | None], tuple[Array, Array]]  # (observation, key or None) -> action, l_pi
 
@@ -90,7 +92,14 @@ def evaluate(
     """
     problem = result.training.problem if problem is None else problem
     key = jax.random.fold_in(jax.random.key(result.config.seed), 1) if key is None else key
-    return evaluate_policy(result.policy(), problem, key, num_episodes, stochastic=stochastic)
+    return _evaluate(result.agents, result.training.settings.agent, problem, key, num_episodes, stochastic)
+
+
+@functools.partial(jax.jit, static_argnames=("num_episodes", "stochastic"))
+def _evaluate(
+    agents: Any, settings: AgentSettings, problem: Problem, key: Array, num_episodes: int, stochastic: bool
+) -> Evaluation:
+    return evaluate_policy(policy_of(agents, settings), problem, key, num_episodes, stochastic=stochastic)
 
 
 def evaluate_policy(

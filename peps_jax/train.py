@@ -24,7 +24,7 @@ from peps_jax.preferences import data
 from peps_jax.preferences.data import Answers, PreferenceSet, Queries
 from peps_jax.preferences.teachers import SYNTHETIC, Teacher
 from peps_jax.round import Round, round_at
-from peps_jax.settings import Settings, settings_of
+from peps_jax.settings import AgentSettings, Settings, settings_of
 from peps_jax.trajectory import Transition
 
 # Minibatches whose rewards are computed at once. All of a round's took two to three times as long on a CPU: what the ensembles'
@@ -85,13 +85,19 @@ class Result:
     def policy(self) -> Callable[[Array, Array | None], tuple[Array, Array]]:
         """(observation, key or None) -> the action and l_pi, log pi(a|s) relative to the uniform policy."""
 
-        def policy(observation: Array, key: Array | None) -> tuple[Array, Array]:
-            observation = jnp.asarray(observation, jnp.float32)
-            if key is None:
-                return sac.mode(self.agents, observation, self.training.settings.agent)
-            return sac.act(self.agents, observation, key, self.training.settings.agent)
+        return policy_of(self.agents, self.training.settings.agent)
 
-        return policy
+
+def policy_of(
+    agents: tuple[sac.Agent, ...], settings: AgentSettings
+) -> Callable[[Array, Array | None], tuple[Array, Array]]:
+    """As `Result.policy`, of `agents` that act together."""
+
+    def policy(observation: Array, key: Array | None) -> tuple[Array, Array]:
+        observation = jnp.asarray(observation, jnp.float32)
+        return sac.mode(agents, observation, settings) if key is None else sac.act(agents, observation, key, settings)
+
+    return policy
 
 
 def check(config: Config) -> None:
@@ -110,20 +116,28 @@ def prepare(config: Config, teacher: Teacher = SYNTHETIC) -> Training:
 
 def init(training: Training, teacher: Teacher = SYNTHETIC) -> TrainingState:
     """The state before the first round, with what the teacher has said before."""
+    state, settings = _untaught(training), training.settings
+    if not training.method.asks:
+        return state
+    spaces = settings.agent.observation_size, settings.agent.action_space
+    room = data.empty(settings.queries.room, settings.queries.segment_length, *spaces)
+    return state.replace(
+        preferences=data.before(teacher.recorded, room, teacher.asks),
+        budget=jnp.asarray(settings.queries.budget if teacher.asks else 0, jnp.int32),
+    )
+
+
+@jax.jit  # one program instead of hundreds of operations, where the caller doesn't compile
+def _untaught(training: Training) -> TrainingState:
     settings, method = training.settings, training.method
     key_agent, key_knowledge, key_actors, key = jax.random.split(jax.random.key(training.config.seed), 4)
     spaces = settings.agent.observation_size, settings.agent.action_space
-    preferences = budget = None
-    if method.asks:
-        room = data.empty(settings.queries.room, settings.queries.segment_length, *spaces)
-        preferences = data.before(teacher.recorded, room, teacher.asks)
-        budget = jnp.asarray(settings.queries.budget if teacher.asks else 0, jnp.int32)
     capacity = settings.schedule.num_rounds * settings.schedule.steps_per_round
     return TrainingState(
         agents=tuple(sac.init(key, settings.agent) for key in sac.agent_keys(key_agent, len(method.rewards))),
         knowledge=method.init(key_knowledge, settings),
-        preferences=preferences,
-        budget=budget,
+        preferences=None,
+        budget=None,
         replay=replay.init(capacity, *spaces, settings.dynamics.perceived_size),
         actors=rollout.init(key_actors, training.problem, settings.rollout),
         key=key,

@@ -90,7 +90,7 @@ def run_of(batch, place):
     return jax.tree.map(lambda leaf: leaf[place], batch)
 
 
-def test_a_vmapped_cell_matches_its_single_run(line, train, train_three):
+def test_a_vmapped_run_matches_its_single_run(line, train, train_three):
     runs = three_runs(line, [0, 0, 5], [0.0, 2.0, 2.4])
     batch = train_three(runs)
     for place in range(3):
@@ -109,7 +109,7 @@ def test_other_leaves_compile_nothing(line, train_three):
 
 
 @pytest.mark.slow
-def test_a_vmapped_cell_matches_its_single_run_in_a_navigation_domain(tiny, train):
+def test_a_vmapped_run_matches_its_single_run_in_a_navigation_domain(tiny, train):
     runs = grid(tiny.replace(method="sac"), seed=[0, 1], temperature=[1.0, 0.5])
     batch = jax.jit(jax.vmap(peps_jax.train))(runs)
     assert_close(run_of(batch.agents, 1), train(run_of(runs, 1)).agents, rtol=1e-2, atol=1e-3)

@@ -6,7 +6,6 @@ that ask for the same one share it.
 
 from __future__ import annotations
 
-import functools
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,7 +18,7 @@ import peps_envs
 from peps_jax.analysis import navigation_planner
 from peps_jax.analysis.surrogate_maps import surrogate_values
 from peps_jax.config import Config
-from peps_jax.evaluate import Evaluation, evaluate
+from peps_jax.evaluate import evaluate
 from peps_jax.execution import batches
 from peps_jax.execution.program import FinishedRun, Times, shared
 from peps_jax.execution.progress import Display
@@ -211,17 +210,12 @@ def _reduce(run: FinishedRun, num_episodes: int, seconds: float) -> Record:
         heat = dict(zip(("learned", "true", "free"), surrogate_values(result), strict=True))
     return Record(
         mode=episodes(run.evaluation),
-        sampled=episodes(_evaluate_samples(result, num_episodes)),
+        sampled=episodes(evaluate(result, num_episodes, stochastic=True)),
         routes=np.asarray(run.evaluation.perceived[:ROUTES]),
         heat=heat,
         failed=run.failed,
         seconds=seconds,
     )
-
-
-@functools.partial(jax.jit, static_argnums=1)
-def _evaluate_samples(result: Result, num_episodes: int) -> Evaluation:
-    return evaluate(result, num_episodes, stochastic=True)
 
 
 _plan_and_walk = jax.jit(

@@ -397,7 +397,7 @@ def member(index: int, count: int) -> list[str]:
 
 
 @pytest.mark.parametrize(("failing", "code"), [(4, 1), (2, 0)])
-def test_a_sweep_of_which_every_cell_failed_says_so_by_its_exit_code(
+def test_a_sweep_of_which_every_run_failed_says_so_by_its_exit_code(
     failing, code, line_task, tmp_path, monkeypatch, capsys
 ):
     left, finite = [failing], program._finite

@@ -155,7 +155,7 @@ def test_what_does_not_fit_is_split_into_batches_of_one_size(line):
         batches.plan(configs, EPISODES, free=need.working)
 
 
-def test_side_by_side_every_cell_needs_its_working_memory():
+def test_side_by_side_every_run_needs_its_working_memory():
     need = memory.Need(state=100, working=1000)
     free = int(10_000 / memory.AVAILABLE_SHARE)
     assert memory.runs_that_fit(need, free, together=False) == 44
@@ -258,7 +258,7 @@ def test_a_sweep_writes_the_whole_grid(swept):
 
 
 @pytest.mark.slow
-def test_a_loaded_cell_acts_and_scores_as_it_did(swept, tiny):
+def test_a_loaded_row_acts_and_scores_as_it_did(swept, tiny):
     row = table(swept)[3]
     assert (row["lam"], row["seed"]) == ("2.4", "4")
     result = peps_jax.load(swept, 3)
@@ -355,7 +355,7 @@ def test_an_interrupted_sweep_keeps_what_is_finished(line, line_task, tmp_path, 
 
 
 @pytest.mark.slow
-def test_a_cell_alone_in_a_split_batch_and_beside_a_failing_one(line, train):
+def test_a_run_alone_in_a_split_batch_and_beside_a_failing_one(line, train):
     configs = [line.replace(method="peps", seed=seed) for seed in (3, 4, 5)]
     configs[1] = configs[1].replace(learning_rate=float("nan"))
     need = program.memory_need(configs[0], EPISODES)
@@ -383,7 +383,7 @@ def test_a_cell_alone_in_a_split_batch_and_beside_a_failing_one(line, train):
     jax.tree.map(close, finished[2].agents[0].policy, alone.agents[0].policy)
 
 
-def test_a_failed_cell_is_a_row_that_says_so(line):
+def test_a_failed_run_is_a_row_that_says_so(line):
     evaluation = peps_jax.Evaluation(
         score=peps_jax.explicability.Score(*np.full((4, 2), np.nan)),
         log_policy=np.zeros(2),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
-from jax.scipy.special import log_ndtr, ndtr
+from jax.scipy.special import erfc
 
 from peps_envs.navigation.geometry import free_interval, walk
 from peps_envs.navigation.parameters import NavigationParams
@@ -22,6 +22,11 @@ def _log_normal(value: Array, mean: Array, variance: Array) -> Array:
     return -0.5 * ((value - mean) ** 2 / variance + jnp.log(2 * math.pi * variance))
 
 
+def _below(standardized: Array) -> Array:
+    """P(xi < standardized), with all its digits where that is small."""
+    return 0.5 * erfc(-standardized / math.sqrt(2))
+
+
 def _log_interval(value: Array, mean: Array, noise: Array, width: Array, low: Array, high: Array) -> Array:
     """log of the integral over x in [low, high] of N(x; mean, noise^2) N(value; x, width^2), exact for noise = 0 too."""
     variance = noise**2 + width**2
@@ -30,23 +35,14 @@ def _log_interval(value: Array, mean: Array, noise: Array, width: Array, low: Ar
     upper, lower = (high - posterior_mean) / posterior_sd, (low - posterior_mean) / posterior_sd
     # the difference of two tails keeps its digits on the side where both are small
     upper, lower = jnp.where(lower > 0, -lower, upper), jnp.where(lower > 0, -upper, lower)
-    mass = jnp.maximum(ndtr(upper) - ndtr(lower), _TINY)
-    return _log_normal(value, mean, variance) + jnp.log(mass)
+    shares = _below(jnp.stack([upper, lower]))
+    return _log_normal(value, mean, variance) + jnp.log(jnp.maximum(shares[0] - shares[1], _TINY))
 
 
-def _log_tail(distance_to_edge: Array, noise: Array) -> Array:
-    """log P(noise * xi > distance_to_edge), exact for noise = 0 too, floored to stay finite."""
-    # beyond 20 standard deviations lies the floor, and the derivative there would be 0 times infinity
-    away = jnp.clip(distance_to_edge / jnp.maximum(noise, 1e-6), -20.0, 20.0)
-    return jnp.maximum(log_ndtr(-away), math.log(_TINY))
-
-
-def _log_stopped(value: Array, mean: Array, noise: Array, width: Array, low: Array, high: Array) -> Array:
-    """log-density at `value` of clip(N(mean, noise^2), low, high) + N(0, width^2): the middle, and what both edges stop."""
-    middle = _log_interval(value, mean, noise, width, low, high)
-    at_low = _log_tail(mean - low, noise) + _log_normal(value, low, width**2)
-    at_high = _log_tail(high - mean, noise) + _log_normal(value, high, width**2)
-    return jnp.logaddexp(middle, jnp.logaddexp(at_low, at_high))
+def _log_edge(value: Array, edge: Array, beyond: Array, noise: Array, width: Array) -> Array:
+    """log-density at `value` of what an edge stops: of a slip noise * xi whatever leads `beyond` it, exact for noise = 0 too."""
+    stopped = jnp.maximum(_below(-beyond / jnp.maximum(noise, 1e-6)), _TINY)
+    return jnp.log(stopped) + _log_normal(value, edge, width**2)
 
 
 @struct.dataclass
@@ -64,24 +60,32 @@ class NavigationDensity(PerceivedDensity):
         return jnp.broadcast_to(self.params.perception_width, (2,))
 
     def _log_moving(self, perceived: Array) -> Array:
-        """log-density, given that it moves. x is integrated piece by piece, because the limits of y change where a wall starts."""
+        """log-density, given that it moves. x is integrated piece by piece, because the limits of y change where a wall starts.
+
+        Of x in a piece and y between its limits there is a density, and what an edge stops, of x or of y, is an atom on it. Each
+        formula stands here once, for all places: programs hold this density many times.
+        """
         params, width, noise = self.params, self.params.perception_width, self.noise
         low, high = free_interval(self.target, 0, params)
         edges = jnp.sort(jnp.concatenate([params.walls[:, 0], params.walls[:, 2]]))
         edges = jnp.clip(jnp.concatenate([low[None], edges, high[None]]), low, high)
+        start, end = edges[:-1], edges[1:]
+        columns = jnp.concatenate([(start + end) / 2, jnp.stack([low, high])])  # x of each piece, and of both atoms
+        limits = jax.vmap(lambda x: jnp.stack(free_interval(jnp.stack([x, self.target[1]]), 1, params)))(columns)
 
-        def log_y(x: Array) -> Array:
-            limits = free_interval(jnp.array([x, self.target[1]]), 1, params)
-            return _log_stopped(perceived[1], self.target[1], noise, width, *limits)
+        both = lambda pair, x, y: jnp.concatenate([jnp.full_like(x, pair[0]), jnp.full_like(y, pair[1])])
+        inner_low, inner_high = jnp.concatenate([start, limits[:, 0]]), jnp.concatenate([end, limits[:, 1]])
+        value, mean = (both(pair, start, columns) for pair in (perceived, self.target))
+        inner = _log_interval(value, mean, noise, width, inner_low, inner_high)
 
-        def piece(start: Array, end: Array) -> Array:
-            log_x = _log_interval(perceived[0], self.target[0], noise, width, start, end)
-            return jnp.where(end > start, log_x + log_y((start + end) / 2), -jnp.inf)
+        x_edges, y_edges = jnp.stack([low, high]), limits.reshape(-1)
+        edge, sign = jnp.concatenate([x_edges, y_edges]), np.tile([-1.0, 1.0], 1 + columns.shape[0]).astype(width.dtype)
+        value, mean = (both(pair, x_edges, y_edges) for pair in (perceived, self.target))
+        stopped = _log_edge(value, edge, sign * (edge - mean), noise, width)
 
-        pieces = jax.vmap(piece)(edges[:-1], edges[1:])
-        at_low = _log_tail(self.target[0] - low, noise) + _log_normal(perceived[0], low, width**2) + log_y(low)
-        at_high = _log_tail(high - self.target[0], noise) + _log_normal(perceived[0], high, width**2) + log_y(high)
-        return jax.nn.logsumexp(jnp.concatenate([pieces, at_low[None], at_high[None]]))
+        log_x = jnp.concatenate([jnp.where(end > start, inner[: start.shape[0]], -jnp.inf), stopped[:2]])
+        y = jnp.concatenate([inner[start.shape[0] :, None], stopped[2:].reshape(-1, 2)], 1)
+        return jax.nn.logsumexp(log_x[:, None] + y)
 
     def log_prob(self, perceived: Array) -> Array:
         staying = jnp.sum(_log_normal(perceived, self.position, self.params.perception_width**2))

@@ -1,0 +1,141 @@
+"""What the programs of a training are made of, and what compiling them takes; writes benchmarks/results/compilation.md.
+
+    python benchmarks/compilation.py [--env nav-d1] [--methods peps sac] [--lines]
+
+Each method in a fresh process without any cache, in CPU-seconds, compiled as `jax.jit` does. `--lines` prints, of each program, the
+lines of StableHLO by the functions that they come from: with all that a function calls, and its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import collections
+import functools
+import os
+import pathlib
+import re
+import resource
+import subprocess
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from peps_jax import Config
+from peps_jax.execution.program import advance, begin, score, shared
+from peps_jax.storage.tables import markdown
+
+OUT = pathlib.Path(__file__).parent / "results" / "compilation.md"
+ROUNDS, EPISODES, STEPS = 10, 100, 8_000
+SHOWN = 30  # functions
+
+
+def programs(env: str, method: str) -> dict[str, tuple[Any, tuple[Any, ...]]]:
+    """Functions and arguments: how a training begins, goes on for some rounds, and is evaluated."""
+    config = shared(Config(env=env, method=method, total_steps=STEPS))
+    state = jax.eval_shape(begin, config)
+    evaluation = lambda state, config: score(state, config, EPISODES)
+    return {
+        "begin": (begin, (config,)),
+        "rounds": (advance, (state, jnp.arange(ROUNDS), config)),
+        "evaluate": (evaluation, (state, config)),
+    }
+
+
+def seconds() -> float:
+    """Of CPU, by this process so far."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def measure(env: str, method: str) -> list[list[str]]:
+    """A row for each program: lines, fusions, and CPU-seconds to trace and lower and to compile it."""
+    rows = []
+    for name, (function, arguments) in programs(env, method).items():
+        start = seconds()
+        lowered = jax.jit(function).lower(*arguments)
+        between = seconds()
+        compiled = lowered.compile()
+        end = seconds()
+        lines, fusions = len(lowered.as_text().splitlines()), compiled.as_text().count(" fusion(")
+        rows.append([method, name, f"{lines:,}", f"{fusions:,}", f"{between - start:.1f}", f"{end - between:.1f}"])
+    return rows
+
+
+# --- where lines come from ------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def function_at(file: str, line: int) -> str:
+    """The innermost function around a line."""
+    around = [
+        node
+        for node in ast.walk(ast.parse(pathlib.Path(file).read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef | ast.Lambda) and node.lineno <= line <= node.end_lineno
+    ]
+    inner = min(around, key=lambda node: node.end_lineno - node.lineno, default=None)
+    name = "module" if inner is None else getattr(inner, "name", f"lambda in line {inner.lineno}")
+    return f"{pathlib.Path(file).stem}.{name}"
+
+
+def by_function(text: str) -> tuple[collections.Counter[str], collections.Counter[str]]:
+    """Lines of StableHLO by this project's functions: with all that they call, and their own."""
+    places = dict(re.findall(r"^(#loc\d*) = loc\((.*)\)$", text, flags=re.MULTILINE))
+
+    @functools.cache
+    def calls(place: str) -> tuple[str, ...]:
+        """Functions that led to a place, the innermost first."""
+        described = places.get(place, "")
+        found = re.match(r'"([^"]+\.py)":(\d+)', described)
+        if found:
+            return (function_at(found[1], int(found[2])),) if "/peps_" in found[1] else ()
+        return tuple(name for inner in re.findall(r"#loc\d*", described) for name in calls(inner))
+
+    whole, own = collections.Counter(), collections.Counter()
+    for place in re.findall(r"^(?!#).* loc\((#loc\d*)\)$", text, flags=re.MULTILINE):
+        names = calls(place)
+        own[names[0] if names else "JAX's own: random bits and the like"] += 1
+        whole.update(set(names))
+    return whole, own
+
+
+def print_lines(env: str, method: str) -> None:
+    """The largest pieces of each program."""
+    for name, (function, arguments) in programs(env, method).items():
+        whole, own = by_function(jax.jit(function).lower(*arguments).as_text(debug_info=True))
+        for title, counted in (("with what they call", whole), ("their own", own)):
+            print(f"\n{env} {method}, {name}: lines by functions, {title}")
+            for function_name, number in counted.most_common(SHOWN):
+                print(f"{number:7,} {function_name}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--env", default="nav-d1")
+    parser.add_argument("--methods", nargs="+", default=["peps", "sac"])
+    parser.add_argument("--lines", action="store_true", help="print what programs are made of, and compile nothing")
+    parser.add_argument("--one", help=argparse.SUPPRESS)  # this process measures one method
+    given = parser.parse_args()
+    if given.one:
+        print("\n".join("\t".join(row) for row in measure(given.env, given.one)))
+        return
+    if given.lines:
+        for method in given.methods:
+            print_lines(given.env, method)
+        return
+    rows = []
+    for method in given.methods:
+        command = [sys.executable, __file__, "--env", given.env, "--one", method]
+        environment = os.environ | {"PEPS_JAX_CACHE": "", "JAX_PLATFORMS": "cpu"}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, encoding="utf-8")
+        rows += [line.split("\t") for line in done.stdout.splitlines()]
+    head = ["method", "program", "lines of StableHLO", "fusions", "CPU-s to trace and lower", "CPU-s to compile"]
+    text = f"{given.env}, defaults, cold in a fresh process:\n\n{markdown(head, rows)}"
+    OUT.write_text(text, encoding="utf-8")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
