@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 MARKED = re.compile(r"<!-- begin (?:(\w+)(?: (\S+/\S+))?|(\S+/\S+)) -->\n.*?<!-- end -->", flags=re.DOTALL)
 
-SHOWN = (("peps", "PEPS"), ("sac", "SAC"))  # methods of the short table
+SHOWN = (("peps", "PEPS"), ("sac", "SAC"), ("drlhp", "DRLHP"))  # methods of the short table
 SCORES = ("return", "explicability")
 BEST = "planner, peps"  # knows the models, and plans for Eq. (6)
 
@@ -48,7 +48,7 @@ def measured(file: str, page: Path) -> str:
 
 
 def headline(file: str) -> str:
-    """Return and explicability of PEPS and SAC in each domain with their intervals, and the planner's explicability."""
+    """Return and explicability of PEPS, SAC and DRLHP in each domain with their intervals, and the planner's explicability."""
     with open(ROOT / file, encoding="utf-8", newline="") as table_:
         rows = {(row["domain"], row["method"]): row for row in csv.DictReader(table_)}
     domains = [domain for domain, method in rows if method == BEST]

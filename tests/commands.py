@@ -30,3 +30,9 @@ def contents(folder: Path) -> dict[str, bytes]:
     found = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()}
     found.pop(results.MANIFEST, None)
     return {name: path.read_bytes() for name, path in found.items()}
+
+
+def everything(folder: Path) -> dict[str, bytes | None]:
+    """All that lies in a folder, by its path inside; folders are None."""
+    found = sorted(folder.rglob("*"))
+    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in found}

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import pytest
 from flax import struct
 from jax import Array
+from sweeps import compiling_into
 
 import peps_jax
 from peps_envs import ActionSpace, Box, Discrete, Environment, Gaussian, Step
@@ -182,3 +183,10 @@ def line() -> Config:
 def train():
     """`peps_jax.train`, compiled once for every structure."""
     return jax.jit(peps_jax.train)
+
+
+@pytest.fixture(scope="session")
+def compiled(tmp_path_factory, worker_id):
+    """The environment of processes that run sweeps; all tests and workers share what they compile."""
+    base = tmp_path_factory.getbasetemp()
+    return compiling_into((base if worker_id == "master" else base.parent) / "compiled")

@@ -16,7 +16,7 @@ import os
 import pickle
 import platform
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -43,28 +43,69 @@ def folder() -> Path | None:
 
 
 def kept(
-    about: str | None, make: Callable[[], Mapping[str, Any]], devices: Sequence[jax.Device] | None = None
+    about: str | None,
+    make: Callable[[], Mapping[str, Any]],
+    devices: Sequence[jax.Device] | None = None,
+    options: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> dict[str, Any]:
     """Compiled programs by name, and other values that can be pickled: from an earlier process, or from `make`.
 
     Args:
       about: what decides them, beside what holds for everything here; None if that can't be told.
+      make: gives programs as they are lowered, which are compiled here, side by side; other values stay as they are.
       devices: of the programs; all by default.
+      options: of the compiler, by the programs' names.
     """
     place, devices = folder(), jax.devices() if devices is None else list(devices)
     if place is None or about is None or jax.process_count() > 1:  # another process has other devices
-        return dict(make())
+        return _compiled(make(), options or {})
     path = place / (files.json_digest([about, [device.id for device in devices], *_surroundings()]) + _SUFFIX)
     with contextlib.suppress(Exception):  # whatever is wrong with a file, it can be made again
         found = _unpacked(files.unseal(path.read_bytes()), devices)
         os.utime(path)
         return found
-    made = dict(make())
+    to_make = make()
+    hits = _jax_hits[0]
+    with _unseen_by_jax():
+        made = _compiled(to_make, options or {})
+    if _jax_hits[0] > hits:
+        return made
     with contextlib.suppress(Exception):  # no room, a backend that can't write programs: what isn't kept runs as well
         files.make_folder(place)
         files.write_whole(path, files.seal(_packed(made)))
         _make_room(place)
     return made
+
+
+def _compiled(values: Mapping[str, Any], options: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    lowered = {name: value for name, value in values.items() if isinstance(value, jax.stages.Lowered)}
+    with ThreadPoolExecutor() as pool:  # the compiler works outside Python's lock
+        done = pool.map(lambda name: lowered[name].compile(compiler_options=dict(options.get(name, {}))), lowered)
+        return dict(values) | dict(zip(lowered, done, strict=True))
+
+
+# A program that came from JAX's own cache can't be written again: what is read back of it lacks functions, and says so when it
+# runs. So JAX isn't given programs that are kept here, and what it has nevertheless isn't kept.
+_jax_hits = [0]
+
+
+def _count_hits(event: str, **_: Any) -> None:
+    _jax_hits[0] += event == "/jax/compilation_cache/cache_hits"
+
+
+jax.monitoring.register_event_listener(_count_hits)
+
+
+@contextlib.contextmanager
+def _unseen_by_jax() -> Iterator[None]:
+    """JAX's own persistent cache keeps nothing that is compiled meanwhile."""
+    name = "jax_persistent_cache_min_compile_time_secs"
+    before = getattr(jax.config, name)
+    jax.config.update(name, float("inf"))
+    try:
+        yield
+    finally:
+        jax.config.update(name, before)
 
 
 def _packed(values: Mapping[str, Any]) -> bytes:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -196,11 +195,12 @@ class Program:
         """Compiles, or takes what was compiled before; returns the seconds that it took."""
         start = time.perf_counter()
         about = written(self._config, self._slots, self._num_episodes, _shapes_of(self._recorded))
-        self._compiled = compilation_cache.kept(about, self._compile, self._devices)
+        once = ("init", "evaluate") if self._devices[0].platform == "cpu" else ()
+        self._compiled = compilation_cache.kept(about, self._lowered, self._devices, dict.fromkeys(once, QUICKLY))
         return time.perf_counter() - start
 
-    def _compile(self) -> dict[str, Any]:
-        """The programs by name."""
+    def _lowered(self) -> dict[str, Any]:
+        """The programs by name, not compiled yet."""
         leaves = self._shapes(stack([self._config] * self._slots))
         recorded = self._recorded
         state = self._shapes(jax.eval_shape(jax.vmap(begin, in_axes=(0, None)), leaves, recorded))
@@ -208,7 +208,7 @@ class Program:
         further = over(advance, whole=(1,), donate=(0,))
         indices = lambda length: jax.ShapeDtypeStruct((length,), jnp.int32)
         evaluation = lambda state, config: score(state, config, self._num_episodes)
-        lowered = {
+        return {
             "init": over(begin, whole=(1,)).lower(leaves, recorded),
             "evaluate": over(evaluation).lower(state, leaves),
             **{
@@ -216,10 +216,6 @@ class Program:
                 for length in sorted(set(self._chunks))
             },
         }
-        with ThreadPoolExecutor() as pool:  # the compiler works outside Python's lock
-            quick = lambda name: QUICKLY if name in ("init", "evaluate") and self._devices[0].platform == "cpu" else {}
-            compiled = pool.map(lambda name: lowered[name].compile(compiler_options=quick(name)), lowered)
-            return dict(zip(lowered, compiled, strict=True))
 
     @property
     def bytes_used(self) -> int:
@@ -319,7 +315,10 @@ def _shapes_of(recorded: PreferenceSet | None) -> list[Any]:
     return [(jnp.shape(leaf), str(jnp.result_type(leaf))) for leaf in jax.tree.leaves(recorded)]
 
 
-_PROGRAMS: dict[Any, Program] = {}  # compiled in this process, as `jax.jit` keeps its own
+MOST_PROGRAMS = (
+    8  # in a process at once: each takes thousands of the memory mappings that Linux lets a process have (65 530)
+)
+_PROGRAMS: dict[Any, Program] = {}  # compiled in this process, the latest last
 
 
 def program(
@@ -331,7 +330,10 @@ def program(
 ) -> tuple[Program, Times]:
     """The compiled program for runs like that of `config`, and what it took: nothing if it was compiled before in this process."""
     key = structure(config), slots, used, num_episodes, id(recorded)
-    if key in _PROGRAMS:
-        return _PROGRAMS[key], Times()
-    _PROGRAMS[key] = Program(config, slots, num_episodes, used, recorded)
-    return _PROGRAMS[key], Times(compile=_PROGRAMS[key].compile())
+    found = _PROGRAMS.pop(key, None)
+    made = Program(config, slots, num_episodes, used, recorded) if found is None else found
+    seconds = made.compile() if found is None else 0.0
+    _PROGRAMS[key] = made
+    for oldest in list(_PROGRAMS)[:-MOST_PROGRAMS]:
+        del _PROGRAMS[oldest]
+    return made, Times(compile=seconds)

@@ -27,7 +27,7 @@ def kept(about, make):
 
 
 def double():
-    return {"double": jax.jit(lambda x: 2 * x).lower(np.float32(1)).compile(), "beside": (1, "two")}
+    return {"double": jax.jit(lambda x: 2 * x).lower(np.float32(1)), "beside": (1, "two")}
 
 
 def refuse():
@@ -40,6 +40,39 @@ def test_what_was_made_is_found_again(place):
     assert found["double"](np.float32(3)) == 6
     assert found["beside"] == (1, "two")
     assert [path.suffix for path in place.iterdir()] == [".program"]
+
+
+BESIDE_JAX = """
+import sys
+import jax, jax.numpy as jnp
+from peps_jax.execution import compilation_cache
+function = jax.jit(lambda x: jnp.sum(x * jax.random.uniform(jax.random.key(0), x.shape)) + jnp.arange(3).astype(float))
+make = lambda: {"function": function.lower(jnp.ones(1000))}
+program = (
+    make()["function"].compile() if sys.argv[1:] else compilation_cache.kept("a", make, jax.devices()[:1])["function"]
+)
+print(program(jnp.ones(1000)))
+"""
+
+
+@pytest.mark.parametrize("known_to_jax", [False, True])
+def test_jaxs_own_cache_beside_it_does_no_harm(known_to_jax, place, tmp_path):
+    """What JAX has read from its cache can't be written again: it would lack functions when it runs."""
+    cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "jax"), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+             "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1"}  # fmt: skip
+    flags = {"XLA_FLAGS": ""}  # as users have it
+
+    def run(*arguments: str) -> str:
+        done = subprocess.run([sys.executable, "-c", BESIDE_JAX, *arguments], env=os.environ | cache | flags, check=True,
+                              capture_output=True, encoding="utf-8")  # fmt: skip
+        return done.stdout
+
+    expected = run("by JAX alone") if known_to_jax else run()
+    for lost in (False, True, False):
+        for path in place.glob("*.program") if lost else ():
+            path.unlink()
+        assert run() == expected
+    assert len(list(place.glob("*.program"))) == (not known_to_jax)
 
 
 @pytest.mark.parametrize("change", ["about", "code", "setting", "flags"])
@@ -118,3 +151,18 @@ def test_another_process_finds_a_trainings_programs(place):
         subprocess.run([sys.executable, "-c", PROGRAM, word], capture_output=True, encoding="utf-8", check=True).stdout
     )
     assert run("new") == run("known")
+
+
+def test_a_process_holds_few_programs_at_once(line, monkeypatch):
+    monkeypatch.setattr(program.Program, "compile", lambda self: 1.0)
+    monkeypatch.setattr(program, "_PROGRAMS", {})
+    one = lambda width: program.program(line.replace(hidden_sizes=(width,)), 1, EPISODES, tuple(jax.devices()[:1]))
+    first, taken = one(1)
+    assert taken.compile == 1
+    for width in range(2, program.MOST_PROGRAMS + 1):
+        one(width)
+    assert one(1) == (first, program.Times()), "used again, it is the latest"
+    one(program.MOST_PROGRAMS + 1)
+    assert len(program._PROGRAMS) == program.MOST_PROGRAMS
+    assert one(1)[0] is first
+    assert one(2)[1].compile == 1, "the one that was longest not used is gone"

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 from commands import exit_code, is_one_complaint
+from records import EPISODES, made_up
 
 import peps_envs
 from peps_jax import Config
@@ -18,10 +19,8 @@ from peps_jax.reproduce import __main__ as command
 from peps_jax.reproduce import figure1, figure3, frontier, plan, queries, store, summary, table1, ways
 from peps_jax.reproduce.driving import experiment
 from peps_jax.reproduce.plan import DOMAINS, METHODS, Plan
-from peps_jax.reproduce.store import Record, Store
+from peps_jax.reproduce.store import Store
 from peps_jax.storage.tables import latex, markdown
-
-EPISODES = 4
 
 
 def call(arguments, tiny) -> int:
@@ -37,17 +36,6 @@ def no_training(monkeypatch):
 
     monkeypatch.setattr(program, "Program", refuse)
     monkeypatch.setattr(plan, "_plan_and_walk", refuse)
-
-
-def made_up(value: float, failed: bool = False, horizon: int = 6) -> Record:
-    """A record whose every score is `value`."""
-    names = ("return", "explicability", "human_return", "length", "goal_reached")
-    figures = {name: np.full(EPISODES, value, np.float32) for name in names} | {"length": np.full(EPISODES, 5.0)}
-    heat = {
-        name: np.linspace(-value, value, 144).reshape(12, 12) ** power for name, power in (("learned", 1), ("true", 3))
-    }
-    routes = np.cumsum(np.full((store.ROUTES, horizon, 2), 0.5), 1)
-    return Record(figures, figures, routes, heat | {"free": np.ones((12, 12), bool)}, failed, seconds=1.0)
 
 
 def fill(folder, base, seeds: int) -> None:
@@ -119,35 +107,6 @@ def test_a_folder_made_by_other_code_is_refused(tmp_path, tiny, monkeypatch):
     monkeypatch.setattr(store, "code_digest", lambda: "another")
     with pytest.raises(ValueError, match="made by other code"):
         Store(tmp_path, tiny, EPISODES, seeds=3)
-
-
-# --- the store ------------------------------------------------------------------------------------------------------------
-
-
-def test_a_record_comes_back_as_it_was(tmp_path, tiny):
-    kept = Store(tmp_path, tiny, EPISODES, seeds=2)
-    kept.open()
-    record, recipe = made_up(3.0, failed=True), store.settings_of(tiny)
-    assert kept.load("one", recipe) is None
-    kept.save("one", recipe, record.arrays())
-    again = Record.of(kept.load("one", recipe))
-    assert (again.failed, again.seconds) == (True, 1.0)
-    np.testing.assert_array_equal(again.routes, record.routes)
-    for part in ("mode", "sampled", "heat"):
-        assert set(getattr(again, part)) == set(getattr(record, part))
-        for name, values in getattr(record, part).items():
-            np.testing.assert_array_equal(getattr(again, part)[name], values)
-    with pytest.raises(ValueError, match="made with other settings"):
-        kept.load("one", store.settings_of(tiny.replace(seed=7)))
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 half a file"])
-def test_a_broken_file_is_said(content, tmp_path, tiny):
-    kept = Store(tmp_path, tiny, EPISODES, seeds=2)
-    kept.open()
-    (tmp_path / store.KEPT / "one.npz").write_bytes(content)
-    with pytest.raises(ValueError, match="can't be read: remove it"):
-        kept.load("one", {})
 
 
 # --- trainings ------------------------------------------------------------------------------------------------------------

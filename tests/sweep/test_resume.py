@@ -6,7 +6,6 @@ import os
 import random
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -14,23 +13,17 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from commands import contents, exit_code
+from commands import contents
+from sweeps import LINE, SIZES, call, start, with_line
 
-import peps_envs
-from peps_jax.execution import batches, checkpoints, compilation_cache, program
+from peps_jax.execution import checkpoints, program
 from peps_jax.storage import files
-from peps_jax.sweep import command, journal, pictures, results, underway
+from peps_jax.sweep import command, journal, results, underway
 
 # a real death takes the threads of Orbax with it; here they come back to a loop that is no more
 pytestmark = pytest.mark.filterwarnings("ignore:(?s).*Event loop is closed:pytest.PytestUnraisableExceptionWarning")
 
 PREFIX = "python -m peps_jax.sweep: error: "
-SIZES = [
-    *("--num-envs", "4", "--rollout-length", "10", "--warmup-steps", "40", "--batch-size", "16"),
-    *("--updates-per-step", "0.1", "--hidden-sizes", "8", "--model-hidden-sizes", "8", "--ensemble-size", "3"),
-    *("--episodes", "4", "--checkpoint-every", "0"),
-]
-LINE = ["--env", "line", "--method", "sac", "--seeds", "4", "--total-steps", "160", *SIZES]  # two batches of two runs
 KILLS, CORRUPTIONS = 50, 24
 
 
@@ -67,17 +60,9 @@ DEATH = Death()
 
 @pytest.fixture(autouse=True)
 def line_task(line, monkeypatch):
-    """The line as an environment that command lines know, in batches of two runs, and a moment's drawing."""
-    task = peps_envs.Task(line.env, line.params, {"noisy": line.belief, "true": line.params})
-    monkeypatch.setitem(peps_envs.registry._TASKS, "line", lambda: task)
-    monkeypatch.setattr(batches, "RUNS_PER_DEVICE", 1)
-    monkeypatch.setattr(pictures, "draw", lambda rows, folder: [])
+    with_line(monkeypatch, line)
     yield
     DEATH.disarm()
-
-
-def call(*arguments: object) -> int:
-    return exit_code(command.main, *arguments)
 
 
 def status(folder: Path) -> str:
@@ -88,10 +73,7 @@ def status(folder: Path) -> str:
 def made(line, tmp_path_factory):
     """Contents of a sweep's folder that was never stopped; and one stopped after three of a batch's four rounds."""
     with pytest.MonkeyPatch.context() as patch:
-        task = peps_envs.Task(line.env, line.params, {"noisy": line.belief, "true": line.params})
-        patch.setitem(peps_envs.registry._TASKS, "line", lambda: task)
-        patch.setattr(batches, "RUNS_PER_DEVICE", 1)
-        patch.setattr(pictures, "draw", lambda rows, folder: [])
+        with_line(patch, line)
         folder = tmp_path_factory.mktemp("whole") / "out"
         assert call(*LINE, "--out", folder) == 0
         stopped = tmp_path_factory.mktemp("stopped") / "out"
@@ -200,23 +182,6 @@ def test_killed_anywhere_and_continued(whole, tmp_path, monkeypatch):
 
 
 ACCESSES_OF_A_SWEEP = 600  # or so
-
-
-@pytest.fixture(scope="module")
-def compiled(tmp_path_factory):
-    """The environment of processes that share what they compile."""
-    cache = str(tmp_path_factory.mktemp("compiled"))
-    return os.environ | {
-        compilation_cache.VARIABLE: cache,
-        "JAX_COMPILATION_CACHE_DIR": cache,
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
-    }
-
-
-def start(environment, *arguments: str) -> subprocess.Popen:
-    command = [sys.executable, "-m", "peps_jax.sweep", *map(str, arguments)]
-    return subprocess.Popen(command, env=environment, encoding="utf-8", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
 @pytest.mark.slow
