@@ -4,6 +4,7 @@
     1    part of the work failed: runs, or another process
     2    bad input, devices or processes that aren't there, a folder that can't be written or is another run's now
     130  Ctrl-C
+    141  nobody reads what it prints any more, as after `| head`
     143  SIGTERM
 
 Whatever ends a command but a fault in the code is one line on stderr.
@@ -74,6 +75,17 @@ class Command(Generic[Flags]):
 
     def carry_out(self, arguments: Sequence[str] | None = None) -> int:
         """Does what the arguments, by default the process's own, ask for; returns the exit code."""
+        try:
+            try:
+                return self._carry_out(arguments)
+            finally:
+                if sys.stdout is not None:
+                    sys.stdout.flush()
+        except BrokenPipeError:
+            _print_no_more()
+            return 141
+
+    def _carry_out(self, arguments: Sequence[str] | None) -> int:
         print_whatever_can_be_shown()
         use_every_core()
         try:
@@ -103,9 +115,22 @@ class Command(Generic[Flags]):
             return _stopped(f"{work.name} stopped: {work.kept()}".lstrip(), reason)
         except (NotWrittenError, IncompatibleError) as error:
             return refuse(self._prog, f"{error}; {work.kept()}")
+        except BrokenPipeError:
+            _print_no_more()
+            work.kept()
+            raise
         except Exception:
             print(f"failed: {work.kept()}", file=sys.stderr)
             raise
+
+
+def _print_no_more() -> None:
+    """What is printed from now on goes nowhere: Python would complain of a closed pipe once more as it ends."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError, AttributeError):
+            os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
 
 
 def _stopped(text: str, reason: BaseException) -> int:

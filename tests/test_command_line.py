@@ -108,6 +108,40 @@ def test_bytes_need_none(line, tmp_path):
     assert not text_without_encoding(source)
 
 
+@pytest.mark.parametrize("arguments", [["--help"], ["--env", "nowhere"]])
+def test_who_prints_for_nobody_ends_quietly(arguments):
+    """`peps-sweep --help | head -1`: no stack, and no complaint of Python's as it ends."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    words = [sys.executable, "-m", "peps_jax.sweep", *arguments]
+    done = subprocess.run(words, stdout=writer, stderr=subprocess.PIPE, cwd=ROOT, check=False, timeout=300)
+    os.close(writer)
+    assert done.returncode == (0 if arguments == ["--help"] else 2)
+    assert done.stderr.count(b"\n") == (0 if arguments == ["--help"] else 1)
+
+
+def test_work_that_prints_for_nobody_is_kept(monkeypatch, capfd):
+    class Prints:
+        name, makes_checkpoints, told = "", False, []
+
+        def run(self, stop):
+            raise BrokenPipeError
+
+        def kept(self):
+            self.told.append("kept")
+
+        writing = staticmethod(contextlib.nullcontext)
+
+        def close(self):
+            self.told.append("closed")
+
+    monkeypatch.setattr(command_line, "_print_no_more", lambda: None)
+    monkeypatch.setattr(command_line, "use_every_core", lambda: None)
+    assert command_line.Command("command", list, lambda flags: Prints()).carry_out([]) == 141
+    assert Prints.told == ["kept", "closed"]
+    assert capfd.readouterr() == ("", "")
+
+
 def test_what_cannot_be_shown_is_replaced(monkeypatch):
     out = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", out)
