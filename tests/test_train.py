@@ -46,6 +46,7 @@ def first_state():
 @pytest.fixture(scope="module")
 def train_three():
     """Three runs as one batch, traced once whatever their leaves are."""
+    chex.clear_trace_counter()  # a worker that is given this module's tests twice makes this fixture twice
     return jax.jit(jax.vmap(chex.assert_max_traces(peps_jax.train, n=1)))
 
 
