@@ -29,7 +29,7 @@ from peps_jax.execution.program import Progress
 from peps_jax.storage import files
 from peps_jax.train import TrainingState
 
-FORMAT = 1  # of the folder's content; another one isn't read
+FORMAT = 2  # of the folder's content; another one isn't read
 KEPT = 2
 COST = 0.01  # of the time, at most, goes into checkpoints that are made by the clock
 HEAD, ARRAYS, PREFIX = "checkpoint.json", "arrays", "rounds-"

@@ -260,8 +260,12 @@ def load(folder: str | os.PathLike[str], row: int | str | Mapping[str, Any]) -> 
     try:
         manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
         rows, configuration = manifest["rows"], manifest["configuration"]
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError):
         raise ValueError(f"folder {str(folder)!r} holds no sweep's results: {MANIFEST} is missing or broken") from None
+    except KeyError as error:
+        raise ValueError(
+            f"folder {str(folder)!r} was written by a version that doesn't fit this one: no {error}"
+        ) from None
     entry = _find(rows, row)
     config = _config(configuration, entry)
     problem = config.problem()

@@ -258,6 +258,12 @@ def test_a_folder_without_results_is_said(tmp_path):
         peps_jax.load(tmp_path, 0)
 
 
+def test_a_folder_of_an_older_version_is_said(tmp_path):
+    (tmp_path / results.MANIFEST).write_text(json.dumps({"cells": [], "configuration": {}}), encoding="utf-8")
+    with pytest.raises(ValueError, match="a version that doesn't fit this one: no 'rows'"):
+        peps_jax.load(tmp_path, 0)
+
+
 def test_an_interrupted_sweep_keeps_what_is_finished(line, line_task, tmp_path, capsys, monkeypatch):
     for name in (results.TABLE, results.PICTURES[0]):
         (tmp_path / name).write_text("an earlier run's", encoding="utf-8")
