@@ -7,6 +7,7 @@ from typing import Any
 
 from rounds import AT_ONCE, PARTS
 
+from peps_jax.drawing.panels import COLOURS, QUIET
 from peps_jax.storage.tables import markdown
 from peps_jax.train import VALUED_TOGETHER
 
@@ -21,8 +22,6 @@ AIMS = {  # of ratios within one run, and of seconds
     "warm start": 3.0,
 }
 AT_MOST = ("linear", "warm start")
-COLOURS = ("#c2255c", "#1c6dd0", "#e8890c", "#2f9e78", "#7048b6", "#5c6770")
-QUIET = "#8a8a8a"
 ALSO_TRIED = (  # each was compared with what is taken, in one process or right after it
     "Tried without gain: XLA's wider vectors, its oneDNN and XNNPACK products, inexact floating-point functions, another "
     "scheduler, bfloat16, an ensemble's networks one after the other. With gain: the noise of a round's actions drawn at once, as "

@@ -20,10 +20,11 @@ from peps_jax.analysis.surrogate_maps import surrogate_values
 from peps_jax.config import Config
 from peps_jax.evaluate import evaluate
 from peps_jax.execution import batches
-from peps_jax.execution.program import FinishedRun, Times, shared
+from peps_jax.execution.program import FinishedRun, Times
 from peps_jax.execution.progress import Display
+from peps_jax.execution.waiting import Reminder
 from peps_jax.reproduce.store import ROUTES, Record, Store, episodes, settings_of
-from peps_jax.train import Result, check
+from peps_jax.train import check
 
 DOMAINS = ("nav-d1", "nav-d2", "nav-d3", "nav-d4")
 METHODS = ("peps", "sac", "drlhp", "policy_shaping", "human_expectation")  # Table 1's, and the human's expectation
@@ -186,7 +187,9 @@ class Plan:
         alone = [what for what in missing if not isinstance(what, Training)]
         for number, what in enumerate(alone, 1):
             print(f"{what.doing}, {number} of {len(alone)}", file=sys.stderr, flush=True)
-            keep(what, what.make(self.num_episodes))
+            with Reminder(what.doing):
+                record = what.make(self.num_episodes)
+            keep(what, record)
         trainings = [what for what in missing if isinstance(what, Training)]
 
         def keep_batch(done: batches.Batch, finished: Sequence[FinishedRun], times: Times) -> None:
@@ -203,14 +206,12 @@ class Plan:
 
 def _reduce(run: FinishedRun, num_episodes: int, seconds: float) -> Record:
     """What is kept of a finished training, its samples' evaluation and r-hat over the map among it."""
-    # names in place of which the training has code and numbers: every environment shares these programs
-    result = Result(run.training.replace(config=shared(run.config)), run.agents, run.knowledge, None, {})
     heat = {}
-    if result.surrogate is not None:
-        heat = dict(zip(("learned", "true", "free"), surrogate_values(result), strict=True))
+    if run.surrogate is not None:
+        heat = dict(zip(("learned", "true", "free"), surrogate_values(run), strict=True))
     return Record(
         mode=episodes(run.evaluation),
-        sampled=episodes(evaluate(result, num_episodes, stochastic=True)),
+        sampled=episodes(evaluate(run, num_episodes, stochastic=True)),
         routes=np.asarray(run.evaluation.perceived[:ROUTES]),
         heat=heat,
         failed=run.failed,

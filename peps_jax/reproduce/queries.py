@@ -7,10 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from peps_jax.analysis.intervals import Estimate
 from peps_jax.drawing.panels import INK, QUIET, panels_of, tidy
 from peps_jax.reproduce.plan import Need, Plan, Training
-from peps_jax.reproduce.summary import Line, estimates, explicability, title, with_interval, write_picture, write_texts
+from peps_jax.reproduce.summary import (
+    Line,
+    estimates,
+    explicability,
+    from_columns,
+    title,
+    with_interval,
+    write_picture,
+    write_texts,
+)
 from peps_jax.storage.tables import markdown
 
 ABOUT = "explicability over the number of queries"
@@ -102,10 +110,7 @@ def _table(lines: Sequence[Line]) -> str:
         for strategy in STRATEGIES:
             points = [line for line in own if line["strategy"] == strategy]
             needed = queries_needed(budgets, [point["explicability"] for point in points], target)
-            shown = [
-                with_interval(Estimate(*(point[f"explicability{end}"] for end in ("", "_low", "_high"))))
-                for point in points
-            ]
+            shown = [with_interval(from_columns(point, "explicability")) for point in points]
             told = f"more than {budgets[-1]:,}" if np.isinf(needed) else f"{needed:,.0f}"
             rows.append([title(domain), strategy.replace("_", " "), *shown, told])
     head = ["domain", "queries chosen by", *(f"{budget:,}" for budget in budgets), f"to {REACHED:.0%} of the way"]

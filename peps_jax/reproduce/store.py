@@ -85,11 +85,6 @@ def settings_of(config: Config) -> dict[str, Any]:
     return files.plain({field.name: getattr(config, field.name) for field in dataclasses.fields(Config)})
 
 
-def digest(*parts: Any) -> str:
-    """A short name for `parts`, which JSON knows."""
-    return files.json_digest(parts)[:16]
-
-
 def code_digest() -> str:
     """A short name for the code that trains, evaluates and plans."""
     return code.digest(*CODE)[:16]
@@ -155,7 +150,7 @@ class Store:
 
     def digest(self, recipe: Mapping[str, Any]) -> str:
         """What tells the record of `recipe` from any other: settings, code, and number of episodes."""
-        return digest(recipe, self._code, self._episodes)
+        return files.json_digest((recipe, self._code, self._episodes))[:16]
 
     def save(self, name: str, recipe: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
         """Keeps arrays by their names. Raises OwnershipLostError if the folder isn't this run's any more."""

@@ -55,12 +55,21 @@ def interval(*scores: Sequence[Sequence[float]], statistic: Any = interquartile_
     return estimate(statistic, *runs)
 
 
+def in_columns(score: str, found: Estimate) -> Line:
+    """An estimate as a line has it: `score`, and the ends of its interval."""
+    return {score: found.value, f"{score}_low": found.low, f"{score}_high": found.high}
+
+
+def from_columns(made: Mapping[str, Any], score: str) -> Estimate:
+    """What `in_columns` was given."""
+    return Estimate(*(made[f"{score}{end}"] for end in ("", "_low", "_high")))
+
+
 def estimates(records: Sequence[Record]) -> Line:
     """Interquartile means of both scores over the seeds, with their intervals."""
     made: Line = {"seeds": len(records)}
     for score in SCORES:
-        found = interval([[record.mean(score) for record in records]])
-        made |= {score: found.value, f"{score}_low": found.low, f"{score}_high": found.high}
+        made |= in_columns(score, interval([[record.mean(score) for record in records]]))
     return made
 
 
@@ -71,8 +80,7 @@ def line(domains: Sequence[str], what: str, groups: Sequence[Sequence[Record]], 
     made |= {"seeds": len(good) // len(domains), "failed": trained - len(good)}
     for score in SCORES:
         values = [[record.mean(score) for record in group] for group in groups]
-        found = interval(values)
-        made |= {score: found.value, f"{score}_low": found.low, f"{score}_high": found.high}
+        made |= in_columns(score, interval(values))
         pooled = np.concatenate(values)
         made |= {f"{score}_mean": mean(pooled), f"{score}_sd": float(np.std(pooled)) if pooled.size else math.nan}
     arrived = [record.mean("goal_reached") for record in good]
@@ -96,7 +104,7 @@ def with_interval(found: Estimate, digits: int = 1) -> str:
 def _estimate(made: Mapping[str, Any], score: str) -> str:
     if score not in made:  # of the planner, which has no seeds
         return decimal(made[f"{score}_mean"])
-    return with_interval(Estimate(made[score], made[f"{score}_low"], made[f"{score}_high"]))
+    return with_interval(from_columns(made, score))
 
 
 def cells(made: Mapping[str, Any], paper: bool) -> list[str]:

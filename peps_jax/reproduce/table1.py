@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from peps_jax.analysis.intervals import Estimate, probability_of_improvement
+from peps_jax.analysis.intervals import probability_of_improvement
 from peps_jax.reproduce import ways
 from peps_jax.reproduce.plan import BASELINES, DOMAINS, METHODS, Need, Plan
 from peps_jax.reproduce.store import Record
@@ -18,7 +18,9 @@ from peps_jax.reproduce.summary import (
     Line,
     cells,
     decimal,
+    from_columns,
     head,
+    in_columns,
     interval,
     line,
     mean,
@@ -105,15 +107,14 @@ def _improvements(groups: Mapping[str, Sequence[Sequence[Record]]]) -> list[Line
                     [[record.mean(score) for record in groups[method][place]] for place in places]
                     for method in ("peps", baseline)
                 )
-                found = interval(ours, theirs, statistic=probability_of_improvement)
-                made |= {score: found.value, f"{score}_low": found.low, f"{score}_high": found.high}
+                made |= in_columns(score, interval(ours, theirs, statistic=probability_of_improvement))
             lines.append(made)
     return lines
 
 
 def _improvement_cells(made: Mapping[str, Any]) -> list[str]:
-    shown = [Estimate(made[score], made[f"{score}_low"], made[f"{score}_high"]) for score in SCORES]
-    return [made["domain"], TITLES[made["baseline"]], *(with_interval(found, 2) for found in shown)]
+    shown = [with_interval(from_columns(made, score), 2) for score in SCORES]
+    return [made["domain"], TITLES[made["baseline"]], *shown]
 
 
 def _covered(plan: Plan, domain: str) -> list[str]:

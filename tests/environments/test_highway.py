@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from highway_cases import GRAVITY, ROAD, TASKS, plans, property_of_all, reset, seeds
+from hypothesis import given
 from hypothesis import strategies as st
 
 import peps_envs
@@ -15,15 +16,6 @@ from peps_envs import highway
 from peps_envs.environment import event
 from peps_envs.highway import classic, collision, environment, simulation, vehicle
 from peps_envs.highway.vehicle import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, LANE_WIDTH, SLOWER, Control
-
-ROAD = highway.Highway()
-reset, step = jax.jit(ROAD.reset), jax.jit(ROAD.step)
-TASKS = {name: peps_envs.make(f"highway-{name}") for name in highway.DOMAINS}
-GRAVITY = vehicle.GRAVITY
-
-property_of_all = settings(deadline=None, derandomize=True, max_examples=60)
-seeds = st.integers(0, 2**31 - 1)
-plans = st.lists(st.integers(0, 4), min_size=8, max_size=8).map(np.int32)
 
 
 def test_a_meta_action_may_be_a_plain_number():

@@ -6,22 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from highway_cases import ROAD, TASKS, plans, property_of_all, reset, seeds, step
+from hypothesis import given
 from hypothesis import strategies as st
 
-import peps_envs
 from peps_envs import highway
-from peps_envs.highway import environment, vehicle
+from peps_envs.highway import environment
 from peps_envs.highway.vehicle import IDLE, LANE_LEFT, SLOWER
-
-ROAD = highway.Highway()
-reset, step = jax.jit(ROAD.reset), jax.jit(ROAD.step)
-TASKS = {name: peps_envs.make(f"highway-{name}") for name in highway.DOMAINS}
-GRAVITY = vehicle.GRAVITY
-
-property_of_all = settings(deadline=None, derandomize=True, max_examples=60)
-seeds = st.integers(0, 2**31 - 1)
-plans = st.lists(st.integers(0, 4), min_size=8, max_size=8).map(np.int32)
 
 
 @jax.jit
