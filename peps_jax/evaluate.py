@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from peps_jax import explicability
+from peps_jax import explicability, generator
 from peps_jax.config import Problem
 from peps_jax.explicability import Score
 from peps_jax.settings import AgentSettings
@@ -91,7 +91,7 @@ def evaluate(
       key: random key; by default one that follows from the training's seed and differs from the training's.
     """
     problem = result.training.problem if problem is None else problem
-    key = jax.random.fold_in(jax.random.key(result.config.seed), 1) if key is None else key
+    key = jax.random.fold_in(generator.key(result.config.seed), 1) if key is None else key
     return _evaluate(result.agents, result.training.settings.agent, problem, key, num_episodes, stochastic)
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from peps_jax import methods, rollout
+from peps_jax import generator, methods, rollout
 from peps_jax.config import Config, Problem
 from peps_jax.learning import replay, sac
 from peps_jax.learning.surrogate import SurrogateState
@@ -130,7 +130,7 @@ def init(training: Training, teacher: Teacher = SYNTHETIC) -> TrainingState:
 @jax.jit  # one program instead of hundreds of operations, where the caller doesn't compile
 def _untaught(training: Training) -> TrainingState:
     settings, method = training.settings, training.method
-    key_agent, key_knowledge, key_actors, key = jax.random.split(jax.random.key(training.config.seed), 4)
+    key_agent, key_knowledge, key_actors, key = jax.random.split(generator.key(training.config.seed), 4)
     spaces = settings.agent.observation_size, settings.agent.action_space
     capacity = settings.schedule.num_rounds * settings.schedule.steps_per_round
     return TrainingState(

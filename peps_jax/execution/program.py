@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from peps_jax import methods
+from peps_jax import generator, methods
 from peps_jax.config import Config
 from peps_jax.evaluate import Evaluation, evaluate
 from peps_jax.execution import compilation_cache, devices, memory
@@ -285,7 +285,7 @@ class Program:
         """`start`'s state on the devices."""
         places = np.asarray(devices.padded(range(len(jax.tree.leaves(start.state)[0])), self._slots))
         shapes = jax.eval_shape(lambda config: begin(config, self._recorded), shared(self._config))
-        keys = lambda leaf, shape: jax.random.wrap_key_data(leaf) if _is_key(shape) else leaf
+        keys = lambda leaf, shape: generator.wrap(leaf) if _is_key(shape) else leaf
         state = jax.tree.map(keys, jax.tree.map(lambda leaf: leaf[places], start.state), shapes)
         return jax.device_put(state, self._sharding)
 

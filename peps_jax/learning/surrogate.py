@@ -20,6 +20,7 @@ import optax
 from flax import struct
 from jax import Array
 
+from peps_jax import generator
 from peps_jax.fields import MOST
 from peps_jax.learning.networks import MLP, apply_ensemble, feature_size, features_of, init_ensemble
 from peps_jax.preferences.data import PreferenceSet, Segments
@@ -85,7 +86,7 @@ def resampled(bootstrap: Array, number: Array, members: int) -> Array:
 
     It follows from a query's identity alone, whenever and in whatever order answers come.
     """
-    key = jax.random.wrap_key_data(bootstrap)
+    key = generator.wrap(bootstrap)
     draw = lambda number: jax.random.uniform(jax.random.fold_in(key, number), (members,), jnp.float32)
     uniform = jax.vmap(draw)(number)
     return jnp.sum(uniform[..., None] > jnp.asarray(_POISSON)[None, None], -1).astype(jnp.float32)

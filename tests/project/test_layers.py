@@ -23,7 +23,7 @@ LAYERS = (
     ("peps_envs.*",),  # environments of one file, which register themselves
     ("peps_envs",),
     ("peps_envs.bridges",),
-    ("peps_jax.storage", "peps_jax.trajectory"),
+    ("peps_jax.storage", "peps_jax.trajectory", "peps_jax.generator"),
     ("peps_jax.fields",),
     ("peps_jax.config",),
     ("peps_jax.settings",),

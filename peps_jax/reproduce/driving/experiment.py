@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from peps_jax import generator
 from peps_jax.config import Config
 from peps_jax.execution.devices import compile_over_devices
 from peps_jax.execution.program import shared
@@ -57,7 +58,7 @@ class Seen(NamedTuple):
 
 def learn(config: Config, episodes: int) -> Seen:
     """One agent, taught by a group of its own, in the rain."""
-    key_group, key_watch = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), 1))
+    key_group, key_watch = jax.random.split(jax.random.fold_in(generator.key(config.seed), 1))
     result = train(config, teachers.recorded(data.recording(*compare(key_group))))
     scenes = watch_agent(result, key_watch, episodes)
     problem = result.training.problem
@@ -174,7 +175,7 @@ def findings(parts: Sequence[Part], seen: Sequence[Seen], number: int = GROUPS) 
                 good = np.flatnonzero(shown.finite[place])
                 pool = lambda rows: rows[place, good].reshape(-1, *rows.shape[3:])  # noqa: B023
                 scenes[part.method] = jax.tree.map(pool, shown.scenes)
-    key = jax.random.fold_in(jax.random.key(parts[0].seeds[0]), 2)
+    key = jax.random.fold_in(generator.key(parts[0].seeds[0]), 2)
     papers = {method: shown for method, shown in scenes.items() if method in RATED}
     wider = groups(key, scenes, road(RAIN).problem(), number) if len(scenes) > len(papers) else []
     rated = groups(key, papers, road(RAIN).problem(), number)
