@@ -20,7 +20,7 @@ from peps_jax.execution.program import stack
 
 ROUNDS = 8
 MOST = 8  # runs in a program: a sweep of many keeps what it has, batch by batch
-LARGEST = 64
+LARGEST = 256
 
 
 def seconds_of(config: Config, runs: int, repeats: int = 3) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ import timing
 from peps_jax import Config
 from peps_jax.learning import networks
 
-Network = Callable[[tuple[networks.Layer, ...], jax.Array], jax.Array]
+Network = Callable[[bool, tuple[networks.Layer, ...], jax.Array], jax.Array]
 
 
 class Case(NamedTuple):
@@ -23,6 +24,7 @@ class Case(NamedTuple):
     members: int
     rows: int
     sizes: tuple[int, ...]
+    normalised: bool = False
 
 
 WAYS: dict[str, Network] = {
@@ -40,8 +42,8 @@ def cases() -> dict[str, Case]:
     compared = config.surrogate_batch_size * 2 * config.segment_length
     return {
         "r̂": Case(config.ensemble_size, compared, (inputs, *config.model_hidden_sizes, 1)),
-        "critics of 64 units": Case(2, config.batch_size, (inputs, 64, 64, 1)),
-        "critics of 256 units": Case(2, config.batch_size, (inputs, 256, 256, 1)),
+        "critics of 64 units": Case(2, config.batch_size, (inputs, 64, 64, 1), config.critic_normalisation),
+        "critics of 256 units": Case(2, config.batch_size, (inputs, 256, 256, 1), config.critic_normalisation),
     }
 
 
@@ -60,7 +62,8 @@ def seconds_of(way: Network, case: Case, steps: int) -> float:
     )
 
     def loss(layers: tuple[networks.Layer, ...], rows: jax.Array) -> jax.Array:
-        return 0.5 * jnp.mean(jax.vmap(way, in_axes=(0, None))(layers, rows) ** 2)
+        network = functools.partial(way, case.normalised)
+        return 0.5 * jnp.mean(jax.vmap(network, in_axes=(0, None))(layers, rows) ** 2)
 
     def descend(layers: tuple[networks.Layer, ...], rows: jax.Array) -> tuple[networks.Layer, ...]:
         step = lambda weights, gradient: weights - 1e-3 * gradient

@@ -18,6 +18,7 @@ AIMS = {  # of ratios within one run, and of seconds
     "fastest peer, 64": 1.0,
     "fastest peer, 256": 1.0,
     "PEPS of SAC": 0.7,
+    "imitation": 20.0,
     "linear": 0.1,
     "warm start": 3.0,
 }
@@ -51,6 +52,8 @@ def ratios(record: Record) -> dict[str, float | None]:
         made[f"fastest peer, {width}"] = rows["peps_jax"]["rate"] / peer[1] if peer else None
         made[f"roofline, {width}"] = rows["peps_jax"]["rate"] / record["roofline"][width]["rate"]
     made["PEPS of SAC"] = training["peps"]["64"]["rate"] / training["sac"]["64"]["peps_jax"]["rate"]
+    peer = fastest_peer(training["drlhp"])
+    made["imitation"] = training["drlhp"]["peps_jax"]["rate"] / peer[1] if peer else None
     made["linear"] = spread_of_seeds(record["growth"]["seeds"], devices)
     made["warm start"] = record["growth"]["compilation"]["warm"]
     return made
@@ -77,6 +80,10 @@ def _table(record: Record) -> str:
         for title, row in sorted(libraries.items(), key=lambda item: -item[1].get("rate", 0.0)):
             ours = None if title == "peps_jax" else libraries["peps_jax"]["rate"]
             rows.append(_row(f"SAC, {width} units", title, row, ours, roofline))
+    libraries = record["training"]["drlhp"]
+    for title, row in libraries.items():
+        ours = None if title == "peps_jax" else libraries["peps_jax"]["rate"]
+        rows.append(_row("DRLHP, 64 units", title, row, ours))
     for width, row in record["training"]["peps"].items():
         rows.append(_row(f"PEPS, {width} units", "peps_jax", row))
     head = ["measured", "program", "environment steps a second", "peps_jax is so many times as fast", "of the roofline"]
@@ -135,7 +142,8 @@ def _equal_work(training: Record) -> str:
         "SAC: D1, 16 environments, an update for every 4 steps, batches of 256, two layers, twin critics, Adam at 1e-3. Ours are "
         "2 trainings on each core. A peer has all cores, as one process or as a training on each, whichever is faster "
         f"(at 64: {', '.join(ways)}). Stable-Baselines3 and SBX step D1 in one NumPy array for all 16, Brax "
-        "and rejax step the JAX environment; evaluations are left out."
+        "and rejax step the JAX environment; evaluations are left out. DRLHP: in 400 steps 30 answers, and "
+        "40 gradient steps on 64 of them by each of five networks; imitation's teacher answers by r_A, which takes it less."
     )
 
 

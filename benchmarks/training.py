@@ -1,4 +1,4 @@
-"""Whole trainings: SAC beside other libraries' at equal work, other ways of laying SAC over the machine, and PEPS."""
+"""Whole trainings: SAC and DRLHP beside other libraries' at equal work, other ways of laying SAC over the machine, and PEPS."""
 
 from __future__ import annotations
 
@@ -29,6 +29,8 @@ LIBRARIES = (
     Library("Brax 0.14.2", "brax", "brax_sac.py", (24_000, 4_000)),
     Library("rejax 0.1.3", "rejax", "rejax_sac.py", (32_000, 4_800)),
 )
+# the preference comparisons that one would pick otherwise, at the first of `WIDTHS`: a round of 400 steps takes it a minute
+COMPARISONS = Library("imitation 1.0.1", "imitation", "imitation_drlhp.py", (800, 0))
 QUICK_STEPS = 480
 
 
@@ -85,5 +87,9 @@ def measure(quick: bool) -> dict[str, Any]:
         }
         for library in LIBRARIES:
             rows[library.title] = theirs(library, width, QUICK_STEPS if quick else library.steps[place], quick)
-    record["peps"]["64"] = ours("peps", 64, 800 if quick else 12_000, runs)
+    steps = 800 if quick else 12_000
+    record["peps"]["64"] = ours("peps", 64, steps, runs)
+    record["drlhp"] = {"peps_jax": ours("drlhp", 64, steps, runs)}
+    if not quick:
+        record["drlhp"][COMPARISONS.title] = theirs(COMPARISONS, 64, COMPARISONS.steps[0], quick=True)
     return record

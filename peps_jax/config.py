@@ -19,9 +19,11 @@ from flax import struct
 import peps_envs
 from peps_envs.registry import unknown_name
 from peps_jax.fields import (
+    CEILING,
     COUNT,
     COUNT_OR_NONE,
     FLOOR,
+    LESS_THAN_ALL,
     NOT_NEGATIVE,
     POSITIVE,
     SHARE,
@@ -37,6 +39,7 @@ from peps_jax.fields import (
 
 STRATEGIES = ("information_gain", "disagreement", "random")
 LEVELS = ("none", "quantile", "max", "standard")
+PRIORS = ("observed", "none")
 ENTROPIES = ("relative", "absolute")
 
 
@@ -87,16 +90,16 @@ class Config:
     )
     gamma: Any = traced(0.995, SHARE, "discount", group="objective")
 
-    total_steps: int = static(40_000, COUNT, "environment steps in all", group="run")
+    total_steps: int = static(20_000, COUNT, "environment steps in all", group="run")
     num_envs: int = static(16, COUNT, "environments side by side", group="run")
     rollout_length: int = static(25, COUNT, "steps that each environment makes in a round", group="run")
     warmup_steps: int = static(
         3_200, COUNT_OR_NONE, "environment steps with uniformly random actions at the start", group="run"
     )
-    exploration: Any = traced(0.2, SHARE, "share of the steps after that with such actions", group="run")
+    exploration: Any = traced(0.1, SHARE, "share of the steps after that with such actions", group="run")
     hold_steps: int = static(5, COUNT, "steps for which such an action is held", group="run")
 
-    learning_rate: Any = traced(1e-3, POSITIVE, "Adam's rate for policy and critics", group="sac")
+    learning_rate: Any = traced(3e-3, POSITIVE, "Adam's rate for policy and critics", group="sac")
     fade_share: Any = traced(
         0.3, SHARE, "share of the rounds, at the end, over which that rate falls to a tenth", group="sac"
     )
@@ -111,9 +114,10 @@ class Config:
     tune_temperature: bool = static(False, SWITCH, "tune the temperature to a target entropy instead", group="sac")
     target_rate: Any = traced(0.01, SHARE, "share of the critics that the targets take over at an update", group="sac")
     reward_scale: Any = traced(0.1, POSITIVE, "what rewards are multiplied by before the critics see them", group="sac")
-    updates_per_step: float = static(0.25, POSITIVE, "SAC updates per environment step", group="sac")
-    batch_size: int = static(256, COUNT, "transitions in a minibatch", group="sac")
+    updates_per_step: float = static(0.5, POSITIVE, "SAC updates per environment step", group="sac")
+    batch_size: int = static(128, COUNT, "transitions in a minibatch", group="sac")
     hidden_sizes: tuple[int, ...] = static((64, 64), SIZES, "hidden layers of policy and critics", group="sac")
+    critic_normalisation: bool = static(True, SWITCH, "whether the critics' hidden layers are normalised", group="sac")
 
     ensemble_size: int = static(5, COUNT, "members of the dynamics and of the surrogate ensemble", group="models")
     model_hidden_sizes: tuple[int, ...] = static(
@@ -130,7 +134,20 @@ class Config:
         "none", LEVELS, f"what pins the surrogate reward's level after the fit: {', '.join(LEVELS)}", group="models"
     )
 
-    num_queries: int = static(3_000, COUNT, "queries that the teacher is asked in all", group="queries")
+    prior: str = static(
+        "observed",
+        PRIORS,
+        f"what PEPS's surrogate reward is learned as a difference from: {', '.join(PRIORS)}",
+        group="models",
+    )
+    bound: float = static(
+        1.0, CEILING, "most that it may be above that prior (in reward units; inf for no bound)", group="models"
+    )
+    uniform_answers: float = static(
+        0.0, LESS_THAN_ALL, "share of the answers that its likelihood takes for random", group="models"
+    )
+
+    num_queries: int = static(300, COUNT_OR_NONE, "queries that the teacher is asked in all", group="queries")
     segment_length: int = static(5, COUNT, "steps of the longest segment", group="queries")
     min_segment_length: int = static(
         2, COUNT, "steps of the shortest segment (unequal lengths pin the level)", group="queries"
@@ -202,8 +219,8 @@ class Config:
 
     @property
     def queries_per_round(self) -> int:
-        """Queries asked in each round until the budget is spent."""
-        return -(-self.num_queries // self.num_rounds)
+        """Queries asked in each round until the budget is spent; there is room for one if nothing is asked."""
+        return max(1, -(-self.num_queries // self.num_rounds))
 
     def check(self) -> None:
         """Raises ValueError, in one line, for the first field whose value makes no sense. Traced values are not looked at.

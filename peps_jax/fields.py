@@ -30,6 +30,8 @@ COUNT = Range(lambda value: (value >= 1) & (value <= MOST), f"a whole number fro
 COUNT_OR_NONE = Range(lambda value: (value >= 0) & (value <= MOST), f"a whole number from 0 to {MOST}")
 SIZES = Range(lambda value: COUNT.holds(value), f"one or more sizes, whole numbers from 1 to {MOST}")
 FLOOR = Range(lambda value: value < np.inf, "a number, or -inf for none")
+CEILING = Range(lambda value: value > 0, "above 0, or inf for none")
+LESS_THAN_ALL = Range(lambda value: (value >= 0) & (value < 1), "from 0 to below 1")
 SWITCH = Range(lambda value: value is True or value is False, "True or False")
 
 

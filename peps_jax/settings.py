@@ -65,6 +65,7 @@ class AgentSettings:
     hidden_sizes: tuple[int, ...] = _static()
     batch_size: int = _static()  # transitions
     updates: int = _static()  # in a round
+    critic_normalisation: bool = _static()  # of hidden layers, by their root mean square
     tune_temperature: bool = _static()
     gamma: Array
     learning_rate: Array
@@ -98,6 +99,8 @@ class SurrogateSettings:
     hidden_sizes: tuple[int, ...] = _static()
     updates: int = _static()  # in a round
     batch_size: int = _static()  # preferences
+    prior: str = _static()  # what r-hat is learned as a difference from, one of `config.PRIORS`
+    bound: float = _static()  # most that it may be above that, in reward units
     level: str = _static()  # what pins r-hat's level, one of `config.LEVELS`
     uniform_answers: float = (
         _static()
@@ -175,7 +178,6 @@ def settings_of(config: Config, problem: Problem) -> Settings:
             config,
             updates=config.surrogate_updates,
             batch_size=config.surrogate_batch_size,
-            uniform_answers=0.0,
             validates=False,
             learning_rate=config.surrogate_learning_rate,
             decay=config.surrogate_decay,

@@ -151,7 +151,7 @@ TINY = dict(
     method="peps", total_steps=160, num_envs=4, rollout_length=10, warmup_steps=40, batch_size=16, updates_per_step=0.1,
     hidden_sizes=(8,), model_hidden_sizes=(8,), ensemble_size=3, dynamics_updates=3, surrogate_updates=3,
     surrogate_batch_size=8, num_queries=20, segment_length=5, min_segment_length=1, query_strategy="information_gain",
-    candidates_per_query=10, level="none", tune_temperature=False, reward_scale=1.0,
+    candidates_per_query=10, level="none", tune_temperature=False, reward_scale=1.0, prior="observed", bound=1.0,
 )  # fmt: skip
 
 

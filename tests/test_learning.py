@@ -15,7 +15,8 @@ def learned(config):
     episodes = evaluate(train(config), 20)
     return episodes.goal_reached, episodes.return_, episodes.explicability, episodes.perceived[0]
 
-configs = [Config(env="nav-d4", belief=belief, total_steps=20_000) for belief in ("unbiased", "biased")]
+sizes = dict(total_steps=20_000, num_queries=3_000)
+configs = [Config(env="nav-d4", belief=belief, **sizes) for belief in ("unbiased", "biased")]
 found = jax.jit(lambda configs: jax.lax.map(learned, configs))(stack(configs))
 print(json.dumps([leaf.tolist() for leaf in found]))
 """

@@ -135,7 +135,7 @@ def test_a_set_that_was_recorded_in_double_precision_is_32_bit():
     with jax.enable_x64(True):
         place = jnp.zeros((4, 2, 5, 1))
         for action, kind in ((place, "float32"), (jnp.zeros((4, 2, 5), jnp.int64), "int32")):
-            segments = Segments(place, action, jnp.ones((4, 2, 5), bool), place, place)
+            segments = Segments(place, action, jnp.ones((4, 2, 5), bool), place[..., 0], place, place)
             assert kinds(segments) >= {"float64"}
             found = data.recording(segments, Answers(jnp.arange(4), jnp.ones(4), jnp.ones(4)))
             assert kinds(found) == {"float32", "int32", "bool"}

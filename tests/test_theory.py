@@ -147,7 +147,8 @@ def taught_by_random_walks(config):
     steps = seen.transition
     weigh = jax.vmap(lambda *step: synthetic_human.log_weight(problem.environment, problem.belief, *step))
     expected, wanted = weigh(seen.state, steps.action, seen.next_state)
-    return surrogate.predict(state, steps.observation, steps.action, own.surrogate), expected, wanted, steps.reward
+    learned = surrogate.predict(state, steps.observation, steps.action, steps.reward, own.surrogate)
+    return learned, expected, wanted, steps.reward
 
 
 def walks(belief):

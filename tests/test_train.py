@@ -8,7 +8,7 @@ import pytest
 from conftest import Line, LineParams
 
 import peps_jax
-from peps_jax import grid
+from peps_jax import generator, grid
 from peps_jax.preferences.data import Answers
 from peps_jax.preferences.teachers import Teacher
 from peps_jax.round import annealed_temperature, round_at
@@ -172,7 +172,7 @@ def test_a_saved_state_continues_as_if_nothing_had_been(line, first_state, step,
     with np.load(tmp_path / "state.npz") as file:
         leaves = [jnp.asarray(file[name]) for name in file.files]
     loaded = jax.tree.unflatten(jax.tree.structure(raw), leaves)
-    loaded = loaded.replace(key=jax.random.wrap_key_data(loaded.key))
+    loaded = loaded.replace(key=generator.wrap(loaded.key))
     whole, curves = step(state, jnp.asarray(1), training)
     resumed, after = step(loaded, jnp.asarray(1), training)
     assert_close(resumed, whole, rtol=0, atol=0)

@@ -53,7 +53,8 @@ def _surrogate_values(
         weights, places = environment.next_state_distribution(before, action, params).quadrature(3)
         after = jax.vmap(lambda place: NavigationState(place, jnp.ones((), jnp.int32)))(places)
         weigh = lambda after: sum(synthetic_human.log_weight(environment, belief, before, action, after))
-        learned = surrogate.predict(state, environment.observe(before, params), action, settings)
+        reward = weights @ jax.vmap(lambda after: environment.reward(before, action, after, params))(after)
+        learned = surrogate.predict(state, environment.observe(before, params), action, reward, settings)
         return learned, weights @ jax.vmap(weigh)(after)
 
     values = jax.vmap(jax.vmap(at, in_axes=(None, 0)), in_axes=(0, None))(positions, actions)

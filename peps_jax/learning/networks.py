@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -15,11 +16,15 @@ import peps_envs
 
 
 class MLP(nn.Module):
-    """Dense layers with ReLU between them, and a linear output."""
+    """Dense layers with ReLU between them, and a linear output.
+
+    `normalised` divides each hidden layer's sums by their root mean square before ReLU (Zhang and Sennrich 2019, without gains).
+    """
 
     hidden_sizes: tuple[int, ...]
     output_size: int
     output_scale: float = 1.0
+    normalised: bool = False
 
     @nn.compact
     def __call__(self, features: Array) -> Array:
@@ -30,7 +35,7 @@ class MLP(nn.Module):
             Weights(*size, init, name=f"Dense_{place}")()
             for place, (size, init) in enumerate(zip(sizes, inits, strict=True))
         )
-        outputs = quicker(self.hidden_sizes)(layers, features.reshape(-1, features.shape[-1]))
+        outputs = quicker(self.hidden_sizes)(self.normalised, layers, features.reshape(-1, features.shape[-1]))
         return outputs.reshape(*features.shape[:-1], self.output_size)
 
 
@@ -66,60 +71,94 @@ class Layer(NamedTuple):
 
 NARROW_UNITS = 32  # a hidden layer's at most for which columns are quicker
 NARROW_OUTPUTS = 8  # outputs at most for which a product with g^T, transposed afterwards, is quicker
+LEAST_SQUARE = 1e-5  # keeps a normalisation from dividing by 0
 FEWER = 4  # times as many units as features, from which on the first layer is cheaper computed again than transposed
 
 _kept = jax.lax.optimization_barrier
 
 
-def quicker(hidden_sizes: tuple[int, ...]) -> Callable[[tuple[Layer, ...], Array], Array]:
+def quicker(hidden_sizes: tuple[int, ...]) -> Callable[[bool, tuple[Layer, ...], Array], Array]:
     """Of `in_columns` and `in_rows`, which are one function."""
     return in_columns if max(hidden_sizes, default=0) <= NARROW_UNITS else in_rows
 
 
-def in_columns(layers: tuple[Layer, ...], rows: Array) -> Array:
+def in_columns(normalised: bool, layers: tuple[Layer, ...], rows: Array) -> Array:
     """Dense layers with ReLU between them: rows (r, n) -> (r, m)."""
     columns = rows.T
     for place, layer in enumerate(layers):
-        columns = _kept(layer.kernel.T) @ (nn.relu(columns) if place else columns) + layer.bias[:, None]
+        if place:
+            columns = nn.relu(_standardized(columns.T)[0].T if normalised else columns)
+        columns = _kept(layer.kernel.T) @ columns + layer.bias[:, None]
     return columns.T
+
+
+def _standardized(sums: Array) -> tuple[Array, Array]:
+    """`sums` (r, n) over their root mean square, row by row, and what it multiplied by, (r, 1)."""
+    scale = jax.lax.rsqrt(_mean(sums**2) + LEAST_SQUARE)
+    return sums * scale, scale
+
+
+def _mean(rows: Array) -> Array:
+    """(r, 1) from (r, n), as a product: XLA's sum over so few columns takes twice as long."""
+    units = rows.shape[-1]
+    return rows @ jnp.full((units, 1), 1 / units, rows.dtype)
 
 
 def _applied(layer: Layer, rows: Array) -> Array:
     return rows @ layer.kernel + layer.bias[None]
 
 
-@jax.custom_vjp
-def in_rows(layers: tuple[Layer, ...], rows: Array) -> Array:
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
+def in_rows(normalised: bool, layers: tuple[Layer, ...], rows: Array) -> Array:
     """As `in_columns`."""
-    return _forward(layers, rows)[0]
+    return _forward(normalised, layers, rows)[0]
 
 
-def _forward(layers: tuple[Layer, ...], rows: Array) -> tuple[Array, tuple[tuple[Layer, ...], list[Array]]]:
-    given = [rows]  # what every layer is given
+class _Known(NamedTuple):
+    """What the gradient is made of."""
+
+    layers: tuple[Layer, ...]
+    given: list[Array]  # what every layer is given
+    standardized: list[tuple[Array, Array]]  # of every hidden layer that is normalised
+
+
+def _forward(normalised: bool, layers: tuple[Layer, ...], rows: Array) -> tuple[Array, _Known]:
+    given, standardized = [rows], []
     for layer in layers[:-1]:
-        given.append(nn.relu(_applied(layer, given[-1])))
-    return _applied(layers[-1], given[-1]), (layers, given)
+        sums = _applied(layer, given[-1])
+        if normalised:
+            standardized.append(_standardized(sums))
+            sums = standardized[-1][0]
+        given.append(nn.relu(sums))
+    return _applied(layers[-1], given[-1]), _Known(layers, given, standardized)
 
 
-def _backward(known: tuple[tuple[Layer, ...], list[Array]], gradient: Array) -> tuple[tuple[Layer, ...], Array]:
-    layers, given = known
+def _backward(normalised: bool, known: _Known, gradient: Array) -> tuple[tuple[Layer, ...], Array]:
+    layers, given, standardized = known
     gradients: list[Layer] = []
     for place in reversed(range(len(layers))):
-        gradients.insert(0, Layer(_kernel_gradient(place, layers, given, gradient), jnp.sum(gradient, 0)))
+        gradients.insert(0, Layer(_kernel_gradient(place, known, gradient), jnp.sum(gradient, 0)))
         gradient = gradient @ layers[place].kernel.T
         if place:
             gradient = jnp.where(given[place] > 0, gradient, 0.0)
+            if normalised:
+                gradient = _through_standardizing(gradient, *standardized[place - 1])
     return tuple(gradients), gradient
 
 
-def _kernel_gradient(place: int, layers: tuple[Layer, ...], given: list[Array], gradient: Array) -> Array:
+def _through_standardizing(gradient: Array, outputs: Array, scale: Array) -> Array:
+    return scale * (gradient - outputs * _mean(gradient * outputs))
+
+
+def _kernel_gradient(place: int, known: _Known, gradient: Array) -> Array:
     """given[place]^T gradient."""
+    layers, given, standardized = known
     inputs, features = given[place], given[0]
     if place == 0:
         return _kept(inputs.T) @ gradient
     if gradient.shape[-1] <= NARROW_OUTPUTS:
         return _kept(_kept(gradient.T) @ inputs).T
-    if place == 1 and FEWER * features.shape[-1] <= inputs.shape[-1]:
+    if place == 1 and not standardized and FEWER * features.shape[-1] <= inputs.shape[-1]:
         first = layers[0]
         return nn.relu(_kept(first.kernel.T) @ features.T + first.bias[:, None]) @ gradient
     return inputs.T @ gradient

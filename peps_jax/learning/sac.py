@@ -53,7 +53,7 @@ def networks(settings: AgentSettings) -> tuple[Head, MLP, MLP]:
     return (
         head,
         MLP(settings.hidden_sizes, head.policy_size, output_scale=0.01),
-        MLP(settings.hidden_sizes, head.critic_size),
+        MLP(settings.hidden_sizes, head.critic_size, normalised=settings.critic_normalisation),
     )
 
 

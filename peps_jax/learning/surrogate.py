@@ -5,6 +5,14 @@
 One function carries both biases of the human, of the belief and of the reward. Preferences between segments of one length
 leave r-hat's level free, a constant per step. In an episodic task such a constant pays the agent for staying alive or charges
 it, so the level has to be pinned: queries with segments of unequal lengths identify it from the answers themselves.
+
+People mostly want the task done. So r-hat may be learned as a difference from the reward that the agent observed,
+
+    r_hat(s, a, r) = r + bound - softplus(c - f(s, a)),    softplus(c) = bound,
+
+0 above it where the network f is 0, as before the first answer, and nowhere more than `bound`. Were belief and reward not biased,
+r_H + l_H would be r_A + l_H, and l_H is at most 0: what surprises costs, and nothing is worth much more than it pays. Few answers
+then can't make a walk in circles worth more than the goal.
 """
 
 from __future__ import annotations
@@ -48,6 +56,7 @@ class Examples(NamedTuple):
 
     features: Array  # (n, 2, steps, feature_size) of the segments
     mask: Array  # (n, 2, steps) bool
+    reward: Array  # (n, 2, steps) r_A
     preferred: Array  # (n,) P(first preferred)
     weights: Array  # (n, members) how much each member's resample makes of each
 
@@ -98,6 +107,7 @@ def _examples(state: SurrogateState, preferences: PreferenceSet, settings: Surro
     return Examples(
         features=features_of(settings.action_space)(preferences.observation, preferences.action),
         mask=preferences.mask,
+        reward=preferences.reward,
         preferred=preferences.preferred,
         weights=copies * preferences.weight[:, None],
     )
@@ -118,10 +128,21 @@ def _minibatches(key: Array, preferences: PreferenceSet, settings: SurrogateSett
 # --- likelihood -----------------------------------------------------------------------------------------------------------
 
 
-def segment_sums(params: Any, features: Array, mask: Array, settings: SurrogateSettings) -> Array:
+def _rewards(params: Any, features: Array, reward: Array, settings: SurrogateSettings) -> Array:
+    """Each member's r_hat, (members, ...), from features (..., n) of (s, a) and the rewards r_A that were observed, (...)."""
+    outputs = apply_ensemble(_network(settings))(params, features)[..., 0]
+    if settings.prior == "none":
+        return outputs
+    if math.isfinite(settings.bound):
+        untaught = settings.bound + math.log(-math.expm1(-settings.bound))  # its softplus is the bound
+        outputs = settings.bound - jax.nn.softplus(untaught - outputs)
+    return reward[None] + outputs
+
+
+def segment_sums(params: Any, features: Array, mask: Array, reward: Array, settings: SurrogateSettings) -> Array:
     """sum_t r_hat over segments, by every member: (members, ...) from features (..., steps, n) and mask (..., steps)."""
     chex.assert_equal_shape_prefix([features, mask], mask.ndim)
-    rewards = apply_ensemble(_network(settings))(params, features)[..., 0]
+    rewards = _rewards(params, features, reward, settings)
     return jnp.sum(jnp.where(mask[None], rewards, 0.0), -1)
 
 
@@ -141,14 +162,14 @@ def answer_logits(difference: Array, uniform_answers: float) -> Array:
 def preference_logits(state: SurrogateState, segments: Segments, settings: SurrogateSettings) -> Array:
     """log P / (1 - P) of the first segment being preferred, by every member: (members, n) from pairs (n, 2, steps, ...)."""
     features = features_of(settings.action_space)(segments.observation, segments.action)
-    sums = segment_sums(state.params, features, segments.mask, settings)
+    sums = segment_sums(state.params, features, segments.mask, segments.reward, settings)
     return answer_logits(sums[..., 0] - sums[..., 1], settings.uniform_answers)
 
 
 def loss(params: Any, examples: Examples, settings: SurrogateSettings) -> tuple[Array, Array]:
     """Bradley-Terry cross-entropy of all members over their examples, and their accuracy; log 2 at a tie."""
     chex.assert_equal_shape_prefix(list(examples), 1)
-    sums = segment_sums(params, examples.features, examples.mask, settings)
+    sums = segment_sums(params, examples.features, examples.mask, examples.reward, settings)
     # (members, n); logits, because exp overflows on long segments
     logits = answer_logits(sums[..., 0] - sums[..., 1], settings.uniform_answers)
     preferred, weights = examples.preferred[None], examples.weights.T
@@ -208,13 +229,15 @@ def _adapt(
 # --- the reward -----------------------------------------------------------------------------------------------------------
 
 
-def pin(state: SurrogateState, observation: Array, action: Array, settings: SurrogateSettings) -> SurrogateState:
+def pin(
+    state: SurrogateState, observation: Array, action: Array, reward: Array, settings: SurrogateSettings
+) -> SurrogateState:
     """Sets shift and scale from what r-hat says of (s, a) that were visited, (n, ...).
 
     "quantile" puts the ensemble's 0.95 quantile at 0 and its 0.05 quantile at -1, "max" its maximum at 0, "standard" every
     member's mean at 0 and its standard deviation at 1 (Christiano et al. 2017, Sec. 2.2.3); "none" takes r-hat as it is.
     """
-    raw = member_rewards(state, observation, action, settings)
+    raw = member_rewards(state, observation, action, reward, settings)
     everyone = lambda value: jnp.broadcast_to(value, state.shift.shape)
     if settings.level == "max":
         return state.replace(shift=everyone(jnp.max(jnp.mean(raw, 0))))
@@ -226,14 +249,18 @@ def pin(state: SurrogateState, observation: Array, action: Array, settings: Surr
     return state
 
 
-def member_rewards(state: SurrogateState, observation: Array, action: Array, settings: SurrogateSettings) -> Array:
+def member_rewards(
+    state: SurrogateState, observation: Array, action: Array, reward: Array, settings: SurrogateSettings
+) -> Array:
     """Each member's r_hat(s, a) before its level is set, (members, ...)."""
     features = features_of(settings.action_space)(observation, action)
-    return apply_ensemble(_network(settings))(state.params, features)[..., 0]
+    return _rewards(state.params, features, reward, settings)
 
 
-def predict(state: SurrogateState, observation: Array, action: Array, settings: SurrogateSettings) -> Array:
+def predict(
+    state: SurrogateState, observation: Array, action: Array, reward: Array, settings: SurrogateSettings
+) -> Array:
     """r_hat(s, a), (...): the mean of the members at their levels."""
-    rewards = member_rewards(state, observation, action, settings)
+    rewards = member_rewards(state, observation, action, reward, settings)
     levelled = jax.vmap(lambda rewards, shift, scale: (rewards - shift) / scale)(rewards, state.shift, state.scale)
     return jnp.mean(levelled, 0)

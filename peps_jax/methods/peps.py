@@ -51,7 +51,7 @@ def learn(
 def reward(knowledge: Knowledge, transitions: Transition, settings: Settings) -> Array:
     """Eq. (6) without its policy entropy, which is SAC's own: r_A + lambda (r_hat + H_T)."""
     observation, action, objective = transitions.observation, transitions.action, settings.objective
-    preferred = surrogate.predict(knowledge.surrogate, observation, action, settings.surrogate)
+    preferred = surrogate.predict(knowledge.surrogate, observation, action, transitions.reward, settings.surrogate)
     entropy = dynamics.environment_entropy(knowledge.dynamics, observation, action, settings.dynamics)
     chex.assert_equal_shape([transitions.reward, preferred, entropy])
     explicable = (

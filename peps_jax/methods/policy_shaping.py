@@ -37,6 +37,7 @@ POLICY_SHAPING = register(
     PREFERENCE_BASED._replace(
         name="policy_shaping",
         rewards=(lambda knowledge, transitions, settings: transitions.reward, preference_based.reward),
+        settings=preference_based.from_nothing,
         behave=act_in_thirds,
     )
 )

@@ -46,7 +46,7 @@ def fit_surrogate(
     key_fit, key_level = jax.random.split(key)
     state, info = surrogate.fit(state, preferences, key_fit, settings.surrogate)
     visited = replay.sample(buffer, key_level, (LEVELLED_ON,), filled)
-    return surrogate.pin(state, visited.observation, visited.action, settings.surrogate), info
+    return surrogate.pin(state, visited.observation, visited.action, visited.reward, settings.surrogate), info
 
 
 def learn(
@@ -60,7 +60,14 @@ def learn(
 
 def reward(knowledge: Knowledge, transitions: Transition, settings: Settings) -> Array:
     """r_hat(s, a)."""
-    return surrogate.predict(knowledge.surrogate, transitions.observation, transitions.action, settings.surrogate)
+    return surrogate.predict(
+        knowledge.surrogate, transitions.observation, transitions.action, transitions.reward, settings.surrogate
+    )
+
+
+def from_nothing(settings: Settings) -> Settings:
+    """r-hat without a prior: of a method in which the reward that the agent observes has no part."""
+    return settings.replace(surrogate=settings.surrogate.replace(prior="none"))
 
 
 # SAC on r-hat alone

@@ -24,7 +24,7 @@ from peps_jax.fields import MOST
 from peps_jax.storage import files
 
 NOBODY = -1  # the number of a place without a query
-FORMAT = 1  # of a file; another one isn't read
+FORMAT = 2  # of a file; another one isn't read
 
 
 class Segments(NamedTuple):
@@ -33,6 +33,7 @@ class Segments(NamedTuple):
     observation: Array  # (..., steps, observation_size)
     action: Array  # (..., steps, action_size) or (..., steps)
     mask: Array  # (..., steps) bool: True where the segment goes on, False after its end
+    reward: Array  # (..., steps) r_A, that the agent observed
     state: Any  # (..., steps, ...) the environment's state before each step: what a person is shown
     next_state: Any  # (..., steps, ...) and after it
 
@@ -60,6 +61,7 @@ class PreferenceSet:
     observation: Array  # (capacity, 2, steps, observation_size)
     action: Array  # (capacity, 2, steps, action_size) or (capacity, 2, steps)
     mask: Array  # (capacity, 2, steps) bool
+    reward: Array  # (capacity, 2, steps) r_A
     preferred: Array  # (capacity,) mean of the answers' P(first preferred)
     weight: Array  # (capacity,) how many people answered
     since: Array  # (capacity,) int32, the round from which on the answer is known
@@ -74,6 +76,7 @@ def empty(capacity: int, steps: int, observation_size: int, action_space: Action
         observation=jnp.zeros((*shape, observation_size), jnp.float32),
         action=jnp.zeros(shape, jnp.int32) if discrete else jnp.zeros((*shape, action_space.size), jnp.float32),
         mask=jnp.zeros(shape, bool),
+        reward=jnp.zeros(shape, jnp.float32),
         preferred=jnp.zeros(capacity, jnp.float32),
         weight=jnp.zeros(capacity, jnp.float32),
         since=jnp.zeros(capacity, jnp.int32),
@@ -100,7 +103,7 @@ def ask(
     segments = segments._replace(mask=segments.mask.astype(bool))
     shown = _padded(segments, preferences.mask.shape[-1])
     nothing = jnp.zeros(per_round, jnp.float32)
-    rows = PreferenceSet(number, shown.observation, shown.action, shown.mask, nothing, nothing, nothing)
+    rows = PreferenceSet(number, shown.observation, shown.action, shown.mask, shown.reward, nothing, nothing, nothing)
     chex.assert_equal_shape_suffix([rows.mask, preferences.mask], 2)
     position = recorded + index * per_round
 
@@ -115,7 +118,7 @@ def ask(
 def _padded(rows: Any, steps: int) -> Any:
     """Segments, or a set, with room for `steps` steps."""
     pad = lambda row: jnp.pad(row, [(0, steps - row.shape[2] if axis == 2 else 0) for axis in range(row.ndim)])
-    fields = {name: pad(getattr(rows, name)) for name in ("observation", "action", "mask")}
+    fields = {name: pad(getattr(rows, name)) for name in ("observation", "action", "mask", "reward")}
     return rows._replace(**fields) if isinstance(rows, Segments) else rows.replace(**fields)
 
 
@@ -124,7 +127,9 @@ def recording(segments: Segments, answers: Answers) -> PreferenceSet:
     number = jnp.arange(segments.mask.shape[0], dtype=jnp.int32)
     nothing = jnp.zeros(number.shape, jnp.float32)
     mask = segments.mask.astype(bool)
-    asked = PreferenceSet(number, segments.observation, segments.action, mask, nothing, nothing, jnp.zeros_like(number))
+    asked = PreferenceSet(
+        number, segments.observation, segments.action, mask, segments.reward, nothing, nothing, jnp.zeros_like(number)
+    )
     return file(_in_32_bits(asked), answers, jnp.zeros((), jnp.int32))
 
 

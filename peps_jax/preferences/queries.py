@@ -42,6 +42,7 @@ def candidates(trajectory: Trajectory, key: Array, settings: QuerySettings) -> S
         observation=cut.transition.observation,
         action=cut.transition.action,
         mask=(offset < length) & ~ended_before,
+        reward=cut.transition.reward,
         state=cut.state,
         next_state=cut.next_state,
     )

@@ -21,7 +21,7 @@ from peps_envs.registry import unknown_name
 from peps_jax.command_line import Command, Parser, called, options
 from peps_jax.config import Config
 from peps_jax.execution.waiting import Reminder
-from peps_jax.reproduce import ablations, figure1, figure2, figure3, frontier, queries, table1
+from peps_jax.reproduce import ablations, answers, figure1, figure2, figure3, frontier, queries, table1
 from peps_jax.reproduce.driving.experiment import STEPS
 from peps_jax.reproduce.plan import DOMAINS, FEW_SEEDS, METHODS, Need, Plan, Training
 from peps_jax.reproduce.queries import QUERY_SEEDS
@@ -53,6 +53,7 @@ RESULTS: dict[str, Result] = {
     "figure2": figure2,
     "figure3": figure3,
     "frontier": frontier,
+    "answers": answers,
     "queries": queries,
     "ablations": ablations,
 }
@@ -72,7 +73,8 @@ def parser() -> Parser:
     """The command line's parser."""
     texts = "\n".join(f"  {name:10} {result.ABOUT}" for name, result in RESULTS.items())
     groups = "\n".join(f"  {name:10} {', '.join(members)}" for name, members in GROUPS.items())
-    epilog = f"results:\n{texts}\n{groups}\n\nfrontier and ablations take the first {FEW_SEEDS} seeds, queries {QUERY_SEEDS}."
+    fewer = f"frontier and ablations take the first {FEW_SEEDS} seeds, queries {QUERY_SEEDS}, answers {answers.SEEDS}."
+    epilog = f"results:\n{texts}\n{groups}\n\n{fewer}"
     made = Parser(PROG, "[RESULT ...] ", description=DESCRIPTION, epilog=epilog)
     made.add_argument("results", nargs="*", default=["paper"], metavar="RESULT", help="what to reproduce [paper]")
     made.add_argument("--out", default="results/reproduce", metavar="DIR", help="folder [results/reproduce]")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,9 @@ def variants(base: Config) -> dict[str, tuple[str, dict[str, Any]]]:
         "r̂'s maximum at 0": ("peps", {"level": "max"}),
         "r̂'s mean at 0, deviation 1": ("peps", {"level": "standard"}),
         "r̂'s level free: equal lengths": ("peps", {"min_segment_length": base.segment_length}),
+        "r̂ from nothing": ("peps", {"prior": "none"}),
+        "r̂ without a bound": ("peps", {"bound": math.inf}),
+        "critics not normalised": ("peps", {"critic_normalisation": False}),
         "single network": ("peps", {"ensemble_size": 1}),
         "DRLHP": ("drlhp", {}),
         "DRLHP, normalised by its authors' way": ("drlhp", {"level": "standard"}),

@@ -47,7 +47,8 @@ def test_predicted_memory_grows_as_what_it_counts(line):
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "width", "size"), [("sac", 128, 256), ("peps", 64, 256)])
 def test_predicted_memory_is_what_xla_reports(method, width, size):
-    config = peps_jax.Config(method=method, hidden_sizes=(width, width), batch_size=size, total_steps=32_000)
+    sizes = dict(batch_size=size, total_steps=32_000, updates_per_step=0.25, num_queries=3_000)
+    config = peps_jax.Config(method=method, hidden_sizes=(width, width), **sizes)
     compiled = program.Program(config, 2, 100, jax.devices()[:1])
     compiled.compile()
     used = compiled.bytes_used

@@ -9,10 +9,12 @@ from flax import linen as nn
 from peps_jax.learning import networks
 
 
-def differentiated(layers, rows):
+def differentiated(layers, rows, normalised):
     """The same network, differentiated by JAX."""
+    norm = nn.RMSNorm(epsilon=1e-5, use_scale=False)
     for layer in layers[:-1]:
-        rows = nn.relu(rows @ layer.kernel + layer.bias[None])
+        rows = rows @ layer.kernel + layer.bias[None]
+        rows = nn.relu(norm.apply({}, rows) if normalised else rows)
     return rows @ layers[-1].kernel + layers[-1].bias[None]
 
 
@@ -21,8 +23,9 @@ def differentiated(layers, rows):
     "sizes", [(3, 2), (3, 16, 8, 1), (9, 40, 1), (3, 40, 40, 4), (12, 40, 40, 12), (3, 40, 8, 20, 12)]
 )
 @pytest.mark.parametrize("members", [None, 3])
-def test_gradient_is_that_of_jax(sizes, members):
-    network = networks.MLP(sizes[1:-1], sizes[-1])
+@pytest.mark.parametrize("normalised", [False, True])
+def test_gradient_is_that_of_jax(sizes, members, normalised):
+    network = networks.MLP(sizes[1:-1], sizes[-1], normalised=normalised)
     keys = jax.random.split(jax.random.key(0), 3)
     features = jax.random.normal(keys[0], (5, 7, sizes[0]))
     if members is None:
@@ -36,7 +39,7 @@ def test_gradient_is_that_of_jax(sizes, members):
     def plainly(params, features):
         tree = params["params"]
         layers = [networks.Layer(**tree[f"Dense_{place}"]) for place in range(len(tree))]
-        outputs = differentiated(layers, features.reshape(-1, sizes[0]))
+        outputs = differentiated(layers, features.reshape(-1, sizes[0]), normalised)
         return outputs.reshape(*features.shape[:-1], sizes[-1])
 
     loss = lambda apply: lambda params, features: jnp.sum(jnp.sin(over(apply)(params, features)))

@@ -23,7 +23,7 @@ def config(line):
     return settings(
         line.replace(
             surrogate_updates=400, surrogate_batch_size=64, surrogate_learning_rate=1e-2, surrogate_decay=0.0,
-            model_hidden_sizes=(16,),
+            model_hidden_sizes=(16,), prior="none", uniform_answers=0.0,
         )
     ).surrogate  # fmt: skip
 
@@ -38,7 +38,8 @@ def random_segments(key, number=NUMBER, mask=None):
     observation = jax.random.uniform(key_observation, (*shape, 1), minval=-1.0)
     action = jax.random.uniform(key_action, (*shape, 1), minval=-1.0)
     point = Point(observation, jnp.zeros(shape, jnp.int32))
-    return Segments(observation, action, jnp.ones(shape, bool) if mask is None else mask, point, point)
+    shown = jnp.ones(shape, bool) if mask is None else mask
+    return Segments(observation, action, shown, jnp.zeros(shape), point, point)
 
 
 def numbered(preferred, weight=None):
@@ -55,8 +56,8 @@ def answered(key, segments, rewards):
 
 
 def visited(key, number=512):
-    """Uniform observations and actions."""
-    return jax.random.uniform(key, (2, number, 1), minval=-1.0)
+    """Uniform observations and actions, and no reward of any."""
+    return *jax.random.uniform(key, (2, number, 1), minval=-1.0), jnp.zeros(number)
 
 
 @jax.jit
@@ -71,7 +72,8 @@ def examples_of(segments, preferred, config, weights=None):
     features = jnp.concatenate([segments.observation, segments.action], -1)
     number = segments.mask.shape[0]
     weights = jnp.ones((number, config.ensemble_size)) if weights is None else weights
-    return Examples(features, segments.mask, jnp.broadcast_to(jnp.asarray(preferred, jnp.float32), number), weights)
+    preferred = jnp.broadcast_to(jnp.asarray(preferred, jnp.float32), number)
+    return Examples(features, segments.mask, segments.reward, preferred, weights)
 
 
 def test_loss_is_log_2_at_a_tie(config):
@@ -110,7 +112,7 @@ def test_weights_choose_what_a_member_sees(config):
     weights = jnp.zeros((2, config.ensemble_size)).at[1, 0].set(2.0)
     examples = examples_of(random_segments(jax.random.key(1), 2), 1.0, config, weights)
     value, _ = surrogate.loss(state.params, examples, config)
-    sums = surrogate.segment_sums(state.params, examples.features, examples.mask, config)
+    sums = surrogate.segment_sums(state.params, examples.features, examples.mask, examples.reward, config)
     np.testing.assert_allclose(value, np.logaddexp(0, -(sums[0, 1, 0] - sums[0, 1, 1])), rtol=1e-5)
 
 
@@ -202,7 +204,7 @@ def test_fit_recovers_the_ranking_of_a_linear_reward(config):
     state, info = taught(preferences, config)
     seen = visited(jax.random.key(3))
     learned = surrogate.predict(state, *seen, config)
-    assert spearmanr(learned, reward(*seen)).statistic > 0.95
+    assert spearmanr(learned, reward(*seen[:2])).statistic > 0.95
     assert float(info["surrogate_loss"]) < math.log(2)
     assert float(info["preference_accuracy"]) > 0.7
 
@@ -246,6 +248,62 @@ def test_the_level_standard_normalises_every_member(config):
     learned = surrogate.predict(state, *seen, config)
     by_hand = np.mean((raw - np.asarray(state.shift)[:, None]) / np.asarray(state.scale)[:, None], 0)
     np.testing.assert_allclose(learned, by_hand, rtol=1e-4, atol=1e-5)
+
+
+# --- a prior ----------------------------------------------------------------------------------------------------------------
+
+
+def bounded(config, bound):
+    return config.replace(prior="observed", bound=bound)
+
+
+@pytest.mark.parametrize("bound", [0.01, 0.5, 50.0, math.inf])
+def test_untaught_it_is_the_reward_that_was_observed(config, bound):
+    config = bounded(config, bound)
+    state = surrogate.init(jax.random.key(0), config)
+    observation, action, _ = visited(jax.random.key(3))
+    observed = 30 * observation[..., 0]
+    nothing = state.replace(params=jax.tree.map(jnp.zeros_like, state.params))
+    np.testing.assert_allclose(surrogate.predict(nothing, observation, action, observed, config), observed, atol=2e-5)
+    near = surrogate.predict(state, observation, action, observed, config)
+    np.testing.assert_allclose(near, observed, atol=0.5)
+    plain = config.replace(prior="none")
+    without = [surrogate.predict(state, observation, action, reward, plain) for reward in (observed, 0 * observed)]
+    np.testing.assert_array_equal(*without)
+
+
+@pytest.mark.parametrize("bound", [0.01, 0.5, 3.0])
+def test_nothing_is_worth_much_more_than_it_pays(config, bound):
+    config = bounded(config, bound)
+    sure = jax.tree.map(lambda leaf: 1e3 * leaf, surrogate.init(jax.random.key(0), config).params)
+    state = surrogate.init(jax.random.key(0), config).replace(params=sure)
+    observation, action, nothing = visited(jax.random.key(3))
+    above = np.asarray(surrogate.predict(state, observation, action, nothing, config))
+    assert np.isfinite(above).all()
+    assert above.max() <= bound + 1e-6
+    assert above.min() < -10.0, "and it may be worth as little as it likes"
+
+
+def test_a_prior_makes_few_answers_enough(config):
+    """Someone who wants what pays, and minds the right side: what differs from the prior is little, and soon learned."""
+    few = jnp.arange(NUMBER) < 60
+    pays = lambda observation, action: 4 * jnp.sin(9 * observation[..., 0]) + 4 * jnp.sin(9 * action[..., 0])
+    minds = lambda observation: -3.0 * (observation[..., 0] > 0)
+    segments = random_segments(jax.random.key(1))
+    observed = pays(segments.observation, segments.action)
+    segments = segments._replace(reward=observed)
+    preferences = answered(jax.random.key(2), segments, observed + minds(segments.observation))
+    preferences = preferences.replace(weight=preferences.weight * few)
+    observation, action, _ = visited(jax.random.key(3))
+    seen = observation, action, pays(observation, action)
+    true = seen[-1] + minds(observation)
+    error = {}
+    for name, own in {"observed": bounded(config, 0.5), "none": config}.items():
+        state, _ = taught(preferences, own.replace(decay=jnp.float32(1e-2)))
+        learned = surrogate.predict(state, *seen, own)
+        error[name] = float(jnp.mean((learned - true) ** 2))
+    assert error["observed"] < 0.5 * float(jnp.mean(minds(observation) ** 2)), "better than the prior alone"
+    assert error["observed"] < 0.2 * error["none"]
 
 
 def test_uniform_answers_bound_the_likelihood(config):

@@ -33,6 +33,15 @@ def test_who_asks_learns_from_answers(line, train, method):
         assert int(result.preferences.weight.sum()) == line.num_queries
 
 
+@pytest.mark.parametrize("method", [name for name, method in methods.METHODS.items() if method.asks])
+def test_without_answers_it_trains_all_the_same(line, train, method):
+    result = train(line.replace(method=method, num_queries=0))
+    assert int(result.preferences.weight.sum()) == 0
+    for leaf in jax.tree.leaves((result.agents, result.knowledge, result.curves)):
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+            assert np.all(np.isfinite(leaf))
+
+
 @pytest.mark.parametrize("method", methods.METHODS)
 def test_lam_changes_something_if_it_is_used(line, train, method):
     one, two = (train(line.replace(method=method, lam=lam)).agents[0].critics for lam in (0.5, 2.4))

@@ -104,7 +104,8 @@ def test_drlhp_has_its_own_likelihood_and_regularisation_and_the_level_that_is_a
     everyones, drlhp = told(), told(method="drlhp")
     assert (everyones.uniform_answers, everyones.validates) == (0.0, False)
     assert (drlhp.uniform_answers, drlhp.validates) == (0.1, True)
-    assert drlhp.replace(uniform_answers=0.0, validates=False) == everyones
+    assert (everyones.prior, drlhp.prior) == ("observed", "none")
+    assert drlhp.replace(uniform_answers=0.0, validates=False, prior="observed") == everyones
     assert told(method="drlhp", level="standard").level == "standard"
     assert Config().level == everyones.level == drlhp.level == "none"
 

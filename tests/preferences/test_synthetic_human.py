@@ -17,7 +17,8 @@ def query(first, second, mask=None):
     places = jnp.asarray([[first, second]], jnp.float32)[..., None]
     before, time = jnp.zeros_like(places), jnp.zeros(places.shape[:-1], jnp.int32)
     mask = jnp.ones(places.shape[:-1], bool) if mask is None else jnp.asarray([mask], bool)
-    return Segments(before, jnp.zeros_like(places), mask, Point(before, time), Point(places, time))
+    nothing = jnp.zeros_like(places)
+    return Segments(before, nothing, mask, nothing[..., 0], Point(before, time), Point(places, time))
 
 
 def weight(place, params):

@@ -16,7 +16,7 @@ from peps_jax.analysis.intervals import Estimate
 from peps_jax.drawing import panels
 from peps_jax.execution import batches, program
 from peps_jax.reproduce import __main__ as command
-from peps_jax.reproduce import figure1, figure3, frontier, plan, queries, store, summary, table1, ways
+from peps_jax.reproduce import answers, figure1, figure3, frontier, plan, queries, store, summary, table1, ways
 from peps_jax.reproduce.driving import experiment
 from peps_jax.reproduce.plan import DOMAINS, METHODS, Plan
 from peps_jax.reproduce.store import Store
@@ -265,8 +265,8 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
     fill(tmp_path, tiny, seeds=3)
     assert call(["all", "--seeds", 3, "--out", tmp_path], tiny) == 0
     written = {path.name for path in tmp_path.iterdir()} - {store.HEAD, store.KEPT}
-    pictures = ("figure1", "figure2", "frontier", "queries")
-    assert written == {"improvement.csv", "queries.md", "frontier.md"} | {
+    pictures = ("figure1", "figure2", "frontier", "queries", "answers")
+    assert written == {"improvement.csv", "queries.md", "frontier.md", "answers.md"} | {
         f"{name}.{kind}" for name in pictures for kind in ("png", "pdf", "csv")
     } | {f"{name}.{kind}" for name in ("table1", "ablations") for kind in ("md", "csv", "tex")}
     lines = lines_of(tmp_path / "table1.csv")
@@ -278,6 +278,8 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
     assert "table1.tex" in printed
     assert "figure3 of 4 methods" in printed
     assert {line["strategy"] for line in lines_of(tmp_path / "queries.csv")} > {"information_gain", "random"}
+    told = {(line["method"], int(line["answers"])) for line in lines_of(tmp_path / "answers.csv")}
+    assert told == {("SAC", 0), ("PEPS", 0)} | {(name, some) for name in answers.VARIANTS for some in (7, 20, 200)}
     assert {line["method"] for line in lines_of(tmp_path / "frontier.csv")} > {"planner", "peps", "sac"}
     before = {path: path.read_bytes() for path in tmp_path.glob("*.p*")}
     assert call(["figure2", "--seeds", 3, "--out", tmp_path], tiny) == 0

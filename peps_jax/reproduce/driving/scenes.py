@@ -44,6 +44,7 @@ def whole(trajectory: Trajectory) -> Segments:
         observation=rows.transition.observation,
         action=rows.transition.action,
         mask=jnp.cumsum(over, 1) - over == 0,
+        reward=rows.transition.reward,
         state=rows.state,
         next_state=rows.next_state,
     )

@@ -1,0 +1,133 @@
+"""How many answers it takes: arrival, return and explicability over the number of answers, method by method."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from peps_jax.config import Config
+from peps_jax.drawing.panels import INK, QUIET, panels_of, tidy
+from peps_jax.reproduce.plan import DOMAINS, Need, Plan, Training
+from peps_jax.reproduce.summary import (
+    Line,
+    decimal,
+    estimates,
+    explicability,
+    from_columns,
+    mean,
+    title,
+    with_interval,
+    write_picture,
+    write_texts,
+)
+from peps_jax.storage.tables import markdown
+
+ABOUT = "arrival, return and explicability over the number of answers"
+SEEDS = 5  # a training that loses its task shows in few
+SHARES = (0, 1 / 3, 1, 10)  # of the plan's queries
+VARIANTS: dict[str, tuple[str, dict[str, Any], str]] = {  # method, changes, colour
+    "PEPS": ("peps", {}, "#c2255c"),
+    "PEPS, r̂ from nothing": ("peps", {"prior": "none"}, "#e599b5"),
+    "DRLHP": ("drlhp", {}, "#e8890c"),
+    "policy shaping": ("policy_shaping", {}, "#2f9e78"),
+}
+SHOWN = {"explicability": "explicability", "arrived": "share of seeds that arrive"}
+_NOTE = """\
+Arrived: the share of seeds whose mode reaches the goal; scores are interquartile means over up to {seeds} seeds with a 95 %
+interval, seeds that don't arrive among them. SAC asks nothing; the planner knows everything.
+"""
+
+
+def budgets(base: Config) -> list[int]:
+    """Numbers of answers, from none on."""
+    return sorted({round(base.num_queries * share) for share in SHARES})
+
+
+def _trainings(plan: Plan, domain: str, variant: str, budget: int) -> list[Training]:
+    method, changes, _ = VARIANTS[variant]
+    return plan.trainings(domain, method, SEEDS, num_queries=budget, **changes)
+
+
+def _asked(plan: Plan) -> Iterator[tuple[str, int]]:
+    """Variants and budgets; with no answer there is nothing but a prior to learn from."""
+    for variant in VARIANTS:
+        for budget in budgets(plan.base):
+            if budget or variant == "PEPS":
+                yield variant, budget
+
+
+def needs(plan: Plan) -> list[Need]:
+    """Every variant with every number of answers; SAC, which asks nothing; and the planner's bound."""
+    asked = [
+        training
+        for domain in DOMAINS
+        for variant, budget in _asked(plan)
+        for training in _trainings(plan, domain, variant, budget)
+    ]
+    sac = [training for domain in DOMAINS for training in plan.trainings(domain, "sac", SEEDS)]
+    return [plan.planned(domain, "peps") for domain in DOMAINS] + sac + asked
+
+
+def _line(plan: Plan, domain: str, name: str, budget: int, trainings: list[Training]) -> Line:
+    records = plan.records(trainings)
+    arrived = mean([record.mean("goal_reached") for record in records])
+    return {"domain": domain, "method": name, "answers": budget, "arrived": arrived} | estimates(records)
+
+
+def write(plan: Plan, folder: Path) -> list[Path]:
+    """answers.{md,csv,png,pdf}."""
+    lines = []
+    for domain in DOMAINS:
+        lines.append(_line(plan, domain, "SAC", 0, plan.trainings(domain, "sac", SEEDS)))
+        for variant, budget in _asked(plan):
+            lines.append(_line(plan, domain, variant, budget, _trainings(plan, domain, variant, budget)))
+    figure = _picture(plan, lines)
+    return [*write_picture(figure, lines, folder, "answers"), *write_texts(folder, {"answers.md": _table(plan, lines)})]
+
+
+def _picture(plan: Plan, lines: list[Line]) -> Any:
+    figure, panels = panels_of(len(SHOWN), len(DOMAINS), 2.9, 2.5)
+    asked = budgets(plan.base)
+    for column, domain in enumerate(DOMAINS):
+        own = [line for line in lines if line["domain"] == domain]
+        level = {
+            "planner": explicability(plan.record(plan.planned(domain, "peps"))),
+            "SAC": next(line["explicability"] for line in own if line["method"] == "SAC"),
+        }
+        for row, (score, words) in enumerate(SHOWN.items()):
+            axes = panels[row, column]
+            tidy(axes)
+            for variant, (_, _, colour) in VARIANTS.items():
+                points = [line for line in own if line["method"] == variant]
+                places = [asked.index(line["answers"]) for line in points]
+                axes.plot(places, [line[score] for line in points], "o-", color=colour, linewidth=1.6, markersize=4,
+                          label=variant)  # fmt: skip
+            axes.set_xticks(range(len(asked)), [f"{budget:,}" for budget in asked])
+            if column == 0:
+                axes.set_ylabel(words, color=INK, fontsize=9)
+        top, bottom = panels[:, column]
+        for name, colour in {"planner": INK, "SAC": QUIET}.items():
+            top.axhline(level[name], color=colour, linewidth=0.9, linestyle=(0, (4, 3)), label=name)
+        gap = max(level["planner"] - level["SAC"], 1.0) if math.isfinite(level["SAC"]) else 10.0
+        # whoever loses the task is far below, and shows in the row beneath
+        top.set_ylim(level["planner"] - 1.6 * gap, level["planner"] + 0.2 * gap)
+        top.set_title(title(domain), color=INK, fontsize=11)
+        bottom.set_ylim(-0.05, 1.05)
+        bottom.set_xlabel("answers", color=INK, fontsize=9)
+    handles, texts = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, texts, frameon=False, fontsize=8, loc="outside lower center", ncols=len(texts))
+    return figure
+
+
+def _table(plan: Plan, lines: list[Line]) -> str:
+    rows = [
+        [
+            title(line["domain"]), line["method"], f"{line['answers']:,}", decimal(line["arrived"], 2),
+            with_interval(from_columns(line, "return")), with_interval(from_columns(line, "explicability")),
+        ]
+        for line in lines
+    ]  # fmt: skip
+    head = ["domain", "method", "answers", "arrived", "return", "explicability"]
+    return "\n".join([markdown(head, rows), _NOTE.format(seeds=SEEDS)])
