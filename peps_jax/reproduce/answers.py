@@ -110,7 +110,7 @@ def _picture(plan: Plan, lines: list[Line]) -> Any:
         top, bottom = panels[:, column]
         for name, colour in {"planner": INK, "SAC": QUIET}.items():
             top.axhline(level[name], color=colour, linewidth=0.9, linestyle=(0, (4, 3)), label=name)
-        gap = max(level["planner"] - level["SAC"], 1.0) if math.isfinite(level["SAC"]) else 10.0
+        gap = max(level["planner"] - level["SAC"], 4.0) if math.isfinite(level["SAC"]) else 10.0
         # whoever loses the task is far below, and shows in the row beneath
         top.set_ylim(level["planner"] - 1.6 * gap, level["planner"] + 0.2 * gap)
         top.set_title(title(domain), color=INK, fontsize=11)
