@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Sequence
 from typing import Any
 
+import equal_work
 import jax
 import timing
 from training import seeds_of, shortened, steps_of
@@ -97,7 +98,7 @@ def _sweep(surroundings: dict[str, str], out: pathlib.Path) -> float:
 
 def measure(quick: bool) -> dict[str, Any]:
     """Seconds for seeds; seconds a step for the other sizes; seconds of compilation."""
-    base = Config(env="nav-d1")
+    base = equal_work.measured()
     base = shortened(base, ROUNDS * base.steps_per_round)
     repeats = 1 if quick else 3
     most = 4 if quick else LARGEST

@@ -7,12 +7,12 @@ import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equal_work
 import jax
 import jax.numpy as jnp
 import numpy as np
 import timing
 
-from peps_jax import Config
 from peps_jax.learning import networks
 
 Network = Callable[[bool, tuple[networks.Layer, ...], jax.Array], jax.Array]
@@ -36,7 +36,7 @@ WAYS: dict[str, Network] = {
 
 def cases() -> dict[str, Case]:
     """What a training of D1 has, as the text calls it, and the same with critics of 256 units."""
-    config = Config(env="nav-d1")
+    config = equal_work.measured()
     environment = config.problem().environment
     inputs = networks.feature_size(environment.observation_size, environment.action_space)
     compared = config.surrogate_batch_size * 2 * config.segment_length

@@ -77,17 +77,21 @@ def _table(record: Record) -> str:
                 rows.append(_row(f"environment {name}", title, other, row["rate"]))
     for width, libraries in record["training"]["sac"].items():
         roofline = record["roofline"][width]["rate"]
-        for title, row in sorted(libraries.items(), key=lambda item: -item[1].get("rate", 0.0)):
-            ours = None if title == "peps_jax" else libraries["peps_jax"]["rate"]
-            rows.append(_row(f"SAC, {width} units", title, row, ours, roofline))
-    libraries = record["training"]["drlhp"]
-    for title, row in libraries.items():
-        ours = None if title == "peps_jax" else libraries["peps_jax"]["rate"]
-        rows.append(_row("DRLHP, 64 units", title, row, ours))
+        rows += _library_rows(f"SAC, {width} units", libraries, roofline)
+    rows += _library_rows("DRLHP, 64 units", record["training"]["drlhp"])
     for width, row in record["training"]["peps"].items():
         rows.append(_row(f"PEPS, {width} units", "peps_jax", row))
     head = ["measured", "program", "environment steps a second", "peps_jax is so many times as fast", "of the roofline"]
     return markdown([*head, "compilation, s"], rows)
+
+
+def _library_rows(measured: str, libraries: dict[str, Record], roofline: float | None = None) -> list[list[str]]:
+    """The fastest first."""
+    rows = []
+    for title, row in sorted(libraries.items(), key=lambda item: -item[1].get("rate", 0.0)):
+        ours = None if title == "peps_jax" else libraries["peps_jax"]["rate"]
+        rows.append(_row(measured, title, row, ours, roofline))
+    return rows
 
 
 def _row(

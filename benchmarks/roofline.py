@@ -16,6 +16,7 @@ import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equal_work
 import jax
 import numpy as np
 import timing
@@ -102,7 +103,7 @@ def measure(quick: bool) -> dict[str, Any]:
     """For each width: multiply-adds of an update, their rate on all devices, and the steps a second that it would allow."""
     record = {}
     for width in WIDTHS:
-        config = Config(env="nav-d1", method="sac", hidden_sizes=(width, width))
+        config = equal_work.measured("sac", width)
         made = products(config)
         loops = 5 if quick else 400 * 64 // width
         taken = seconds_of(made, config.batch_size, loops)

@@ -6,6 +6,7 @@ import importlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equal_work
 import jax
 import jax.numpy as jnp
 import timing
@@ -124,8 +125,7 @@ def measure(quick: bool) -> dict[str, dict[str, float]]:
     """Of PEPS at width 64, and of SAC at each width."""
     steps, repeats = (800, 1) if quick else (8_000, 7)
     rounds = [("peps", 64), *(("sac", width) for width in WIDTHS)]
-    config = lambda method, width: Config(env="nav-d1", method=method, hidden_sizes=(width, width))
     return {
-        f"{method} {width}": seconds_of_parts(shortened(config(method, width), steps), repeats)
+        f"{method} {width}": seconds_of_parts(shortened(equal_work.measured(method, width), steps), repeats)
         for method, width in rounds
     }

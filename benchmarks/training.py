@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import equal_work
 import jax
 import peer
 import timing
@@ -60,9 +61,8 @@ def seeds_of(config: Config, number: int) -> list[Config]:
 
 
 def ours(method: str, width: int, steps: int, runs: int, **layout: Any) -> dict[str, float]:
-    """`runs` trainings of D1, at the package's defaults but for their length and width."""
-    config = Config(env="nav-d1", method=method, hidden_sizes=(width, width))
-    return cost(seeds_of(shortened(config, steps), runs), **layout)
+    """`runs` trainings of D1 at the peers' work."""
+    return cost(seeds_of(shortened(equal_work.measured(method, width), steps), runs), **layout)
 
 
 def theirs(library: Library, width: int, steps: int, quick: bool) -> dict[str, Any]:

@@ -61,6 +61,17 @@ def tidy(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
+def bound(axes: Axes, name: str, level: float, colour: str) -> None:
+    """A dashed line at what something else reaches."""
+    axes.axhline(level, color=colour, linewidth=0.9, linestyle=(0, (4, 3)), label=name)
+
+
+def legend_below(figure: Figure, axes: Axes) -> None:
+    """What `axes` shows, as one row under all panels."""
+    handles, texts = axes.get_legend_handles_labels()
+    figure.legend(handles, texts, frameon=False, fontsize=8, loc="outside lower center", ncols=len(texts))
+
+
 def colour(role: str) -> str:
     """The colour of a role in a scene; any other colour is itself."""
     return ROLES.get(role, role)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from peps_jax.config import Config
-from peps_jax.drawing.panels import INK, QUIET, panels_of, tidy
+from peps_jax.drawing.panels import INK, QUIET, bound, colour_of, legend_below, panels_of, tidy
 from peps_jax.reproduce.plan import DOMAINS, Need, Plan, Training
 from peps_jax.reproduce.summary import (
     Line,
@@ -28,10 +28,10 @@ ABOUT = "arrival, return and explicability over the number of answers"
 SEEDS = 5  # a training that loses its task shows in few
 SHARES = (0, 1 / 3, 1, 10)  # of the plan's queries
 VARIANTS: dict[str, tuple[str, dict[str, Any], str]] = {  # method, changes, colour
-    "PEPS": ("peps", {}, "#c2255c"),
+    "PEPS": ("peps", {}, colour_of("peps")),
     "PEPS, r̂ from nothing": ("peps", {"prior": "none"}, "#e599b5"),
-    "DRLHP": ("drlhp", {}, "#e8890c"),
-    "policy shaping": ("policy_shaping", {}, "#2f9e78"),
+    "DRLHP": ("drlhp", {}, colour_of("drlhp")),
+    "policy shaping": ("policy_shaping", {}, colour_of("policy_shaping")),
 }
 SHOWN = {"explicability": "explicability", "arrived": "share of seeds that arrive"}
 _NOTE = """\
@@ -109,15 +109,14 @@ def _picture(plan: Plan, lines: list[Line]) -> Any:
                 axes.set_ylabel(words, color=INK, fontsize=9)
         top, bottom = panels[:, column]
         for name, colour in {"planner": INK, "SAC": QUIET}.items():
-            top.axhline(level[name], color=colour, linewidth=0.9, linestyle=(0, (4, 3)), label=name)
+            bound(top, name, level[name], colour)
         gap = max(level["planner"] - level["SAC"], 4.0) if math.isfinite(level["SAC"]) else 10.0
         # whoever loses the task is far below, and shows in the row beneath
         top.set_ylim(level["planner"] - 1.6 * gap, level["planner"] + 0.2 * gap)
         top.set_title(title(domain), color=INK, fontsize=11)
         bottom.set_ylim(-0.05, 1.05)
         bottom.set_xlabel("answers", color=INK, fontsize=9)
-    handles, texts = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, texts, frameon=False, fontsize=8, loc="outside lower center", ncols=len(texts))
+    legend_below(figure, panels[0, 0])
     return figure
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from peps_jax.drawing.panels import INK, QUIET, panels_of, tidy
+from peps_jax.drawing.panels import INK, QUIET, bound, legend_below, panels_of, tidy
 from peps_jax.reproduce.plan import Need, Plan, Training
 from peps_jax.reproduce.summary import (
     Line,
@@ -62,7 +62,7 @@ def write(plan: Plan, folder: Path) -> list[Path]:
             "SAC": (estimates(plan.records(_unasked(plan, domain)))["explicability"], QUIET),
         }
         for name, (level, colour) in levels.items():
-            axes.axhline(level, color=colour, linewidth=0.9, linestyle=(0, (4, 3)), label=name)
+            bound(axes, name, level, colour)
             lines.append({"domain": domain, "strategy": name, "explicability": level})
         for strategy, colour in STRATEGIES.items():
             own = [estimates(plan.records(_asked(plan, domain, strategy, budget))) for budget in _budgets(plan)]
@@ -84,8 +84,7 @@ def write(plan: Plan, folder: Path) -> list[Path]:
         axes.set_title(title(domain), color=INK, fontsize=11)
         axes.set_xlabel("queries", color=INK, fontsize=9)
     panels[0, 0].set_ylabel("explicability", color=INK, fontsize=9)
-    handles, texts = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, texts, frameon=False, fontsize=8, loc="outside lower center", ncols=len(texts))
+    legend_below(figure, panels[0, 0])
     return [*write_picture(figure, lines, folder, "queries"), *write_texts(folder, {"queries.md": _table(lines)})]
 
 
