@@ -14,7 +14,7 @@ from training import WIDTHS, seeds_of, shortened
 
 from peps_jax import Config, rollout
 from peps_jax.execution.program import stack
-from peps_jax.learning import dynamics, replay, sac
+from peps_jax.learning import dynamics, replay, team
 from peps_jax.methods import peps, preference_based
 from peps_jax.preferences import data
 from peps_jax.preferences.data import PreferenceSet
@@ -49,7 +49,7 @@ def prepare(config: Config) -> Prepared:
     training, index, key = train.prepare(config), config.num_rounds // 2, jax.random.key(1)
     state, _ = train.run_rounds(train.init(training), jnp.arange(index, dtype=jnp.int32), training)
     settings = training.settings
-    act = lambda observation, key, time: sac.act(state.agents, observation, key, settings.agent)[0]
+    act = lambda observation, key, time: team.act(state.agents, observation, key, settings.agent)[0]
     _, trajectory, _ = rollout.collect(state.actors, act, key, training.problem, settings.rollout)
     preferences = None if state.preferences is None else data.known(state.preferences, index)
     batches = replay.sample(

@@ -40,6 +40,7 @@ from peps_jax.fields import (
 STRATEGIES = ("information_gain", "disagreement", "random")
 LEVELS = ("none", "quantile", "max", "standard")
 PRIORS = ("observed", "none")
+PRODUCTS = ("candidates", "gaussians")
 ENTROPIES = ("relative", "absolute")
 
 
@@ -64,7 +65,7 @@ class Config:
     method: str = static(
         "peps",
         None,
-        "what is learned, and from which reward: peps, sac, drlhp, policy_shaping or human_expectation",
+        "what is learned, and from which reward: peps, sac, drlhp, policy_shaping, oracle or human_expectation",
         group="task",
     )
     seed: Any = traced(0, COUNT_OR_NONE, "random seed", group="task")
@@ -110,6 +111,12 @@ class Config:
     anneal_share: Any = traced(0.8, SHARE, "share of the rounds over which the temperature fades", group="sac")
     saturation_penalty: Any = traced(
         0.02, NOT_NEGATIVE, "price of a squared action before tanh (in reward units)", group="sac"
+    )
+    product: str = static(
+        "candidates",
+        PRODUCTS,
+        f"how policy shaping's two policies act together: {', '.join(PRODUCTS)}",
+        group="sac",
     )
     tune_temperature: bool = static(False, SWITCH, "tune the temperature to a target entropy instead", group="sac")
     target_rate: Any = traced(0.01, SHARE, "share of the critics that the targets take over at an update", group="sac")

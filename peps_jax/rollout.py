@@ -110,7 +110,8 @@ def collect(
         start, first = reset(split(key_reset), params)
         restart = lambda new, old: jax.vmap(jnp.where)(over, new, old)
         moved = jax.vmap(movement, in_axes=(0, 0, None))(state, after.state, problem)
-        transition = Transition(observation, action, after.reward, seen, moved, after.terminated)
+        unscored = jnp.zeros(settings.num_envs, jnp.float32)  # all steps are scored at once, below
+        transition = Transition(observation, action, after.reward, seen, moved, after.terminated, unscored)
         row = Trajectory(transition, after.truncated, after.events, state, after.state)
         return (jax.tree.map(restart, start, after.state), restart(_seen(first), seen)), row
 
@@ -120,7 +121,9 @@ def collect(
 
     score = jax.vmap(jax.vmap(lambda *transition: explicability.score(problem, *transition)))
     scores = score(trajectory.state, trajectory.transition.action, trajectory.next_state)
-    over = trajectory.transition.terminated | trajectory.truncated
+    transition = trajectory.transition._replace(human_value=scores.log_belief + scores.human_return)
+    trajectory = trajectory._replace(transition=transition)
+    over = transition.terminated | trajectory.truncated
     values = Running(scores, jnp.ones_like(scores.return_))
     totals, running = explicability.episode_sums(values, over, actors.running)
     return (

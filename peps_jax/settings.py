@@ -66,6 +66,7 @@ class AgentSettings:
     batch_size: int = _static()  # transitions
     updates: int = _static()  # in a round
     critic_normalisation: bool = _static()  # of hidden layers, by their root mean square
+    product: str = _static()  # how several agents act together, one of `config.PRODUCTS`
     tune_temperature: bool = _static()
     gamma: Array
     learning_rate: Array

@@ -17,7 +17,7 @@ from jax import Array
 
 from peps_jax import generator, methods, rollout
 from peps_jax.config import Config, Problem
-from peps_jax.learning import replay, sac
+from peps_jax.learning import replay, sac, team
 from peps_jax.learning.surrogate import SurrogateState
 from peps_jax.methods import Method
 from peps_jax.preferences import data
@@ -95,7 +95,7 @@ def policy_of(
 
     def policy(observation: Array, key: Array | None) -> tuple[Array, Array]:
         observation = jnp.asarray(observation, jnp.float32)
-        return sac.mode(agents, observation, settings) if key is None else sac.act(agents, observation, key, settings)
+        return team.mode(agents, observation, settings) if key is None else team.act(agents, observation, key, settings)
 
     return policy
 
@@ -153,7 +153,8 @@ def collect_and_ask(
     """The first half of a round: act, remember, and choose what to ask. Queries are None of a method that asks nothing."""
     settings, method = training.settings, training.method
     key_act, key_hold = jax.random.split(now.keys.act)
-    behave = lambda observation, key: method.behave(state.agents, observation, key, settings.agent)
+    agent = settings.agent.replace(temperature=now.temperature)
+    behave = lambda observation, key: method.behave(state.agents, observation, key, agent)
     act = rollout.exploring(behave, settings.agent.action_space, now.explores_only, key_hold, settings.rollout)
     actors, trajectory, info = rollout.collect(state.actors, act, key_act, training.problem, settings.rollout)
     flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), trajectory.transition)
@@ -188,21 +189,20 @@ def improve(state: TrainingState, now: Round, training: Training) -> tuple[tuple
     batches = replay.sample(state.replay, key_batch, shape, now.filled)
     temperature = (now.temperature + method.entropy_weight(settings)) * settings.agent.reward_scale
     current = settings.agent.replace(learning_rate=now.learning_rate)
-
-    def update(agent: sac.Agent, step: tuple[Transition, sac.Noise]) -> tuple[sac.Agent, dict[str, Array]]:
-        batch, noise = step
-        return sac.update(agent, batch, temperature, noise, current)
-
-    agents, infos = [], []
     keys = sac.agent_keys(key_update, len(method.rewards))
-    for agent, reward, key in zip(state.agents, method.rewards, keys, strict=True):
+    steps = team.Step(
+        batch=batches,
         # before the updates: what the method knows doesn't change within a round
-        rewards = value(reward, state.knowledge, batches, settings) * settings.agent.reward_scale
-        noise = sac.draw_noise(key, shape, settings.agent)
-        agent, info = jax.lax.scan(update, agent, (batches._replace(reward=rewards), noise))
-        agents.append(agent)
-        infos.append(info)
-    return tuple(agents), jax.tree.map(lambda *values: jnp.mean(jnp.stack(values)), *infos)
+        rewards=tuple(
+            value(reward, state.knowledge, batches, settings) * settings.agent.reward_scale for reward in method.rewards
+        ),
+        noises=tuple(sac.draw_noise(key, shape, settings.agent) for key in keys),
+        key=jax.random.split(jax.random.fold_in(key_update, settings.agent.updates), settings.agent.updates),
+    )
+    agents, infos = jax.lax.scan(
+        lambda agents, step: team.update(agents, step, temperature, current), state.agents, steps
+    )
+    return agents, jax.tree.map(jnp.mean, infos)
 
 
 def value(

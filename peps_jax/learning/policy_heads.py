@@ -44,6 +44,9 @@ class Head(NamedTuple):
     log_ratio: Callable[[Any, Array], Array]  # (policy, action from elsewhere) -> l_pi
     product: Callable[[Any], Any]  # several policies, stacked -> their normalised product
     critics: Callable[[Any, Any, Array, Array], Array]  # (network, params, observation, action) -> (critics, ...)
+    # (stacked policies, key, shape, number) -> so many actions of each policy and of the uniform one, (candidates, *shape, ...),
+    # and the log-density of being proposed, relative to the uniform policy (candidates, *shape)
+    propose: Callable[[Any, Array, tuple[int, ...], int], tuple[Array, Array]]
     penalty: Callable[[Any], Array]  # policy -> what keeps it where gradients reach it, at least 0
     # (policy, noise, network, params, observation) -> E_pi[min Q], E_pi[l_pi]
     expect: Callable[[Any, Array, Any, Any, Array], tuple[Array, Array]]
@@ -97,6 +100,18 @@ def continuous_head(observation_size: int, action_size: int) -> Head:
         limit = 1 - 1e-6
         return squashed(policy).log_prob(jnp.clip(action, -limit, limit)) + log_volume
 
+    def propose(policies: Gaussian, key: Array, shape: tuple[int, ...], number: int) -> tuple[Array, Array]:
+        key_normal, key_uniform = jax.random.split(key)
+        agents = policies.mean.shape[0]
+        normal = jax.random.normal(key_normal, (number, agents, *shape, action_size), jnp.float32)
+        drawn = jax.vmap(lambda noise: sample(policies, noise)[0])(normal)
+        drawn = drawn.reshape(number * agents, *shape, action_size)
+        uniform = jax.random.uniform(key_uniform, (number, *shape, action_size), jnp.float32, minval=-1.0, maxval=1.0)
+        action = jnp.concatenate([drawn, uniform])
+        density = jax.vmap(lambda one: jax.vmap(lambda policy: log_ratio(policy, one))(policies))(action)
+        with_uniform = jnp.concatenate([density, jnp.zeros_like(density[:, :1])], 1)
+        return action, jax.scipy.special.logsumexp(with_uniform, 1) - math.log(agents + 1)
+
     def critics(network: MLP, params: Any, observation: Array, action: Array) -> Array:
         return apply_ensemble(network)(params, jnp.concatenate([observation, action], -1))[..., 0]
 
@@ -114,6 +129,7 @@ def continuous_head(observation_size: int, action_size: int) -> Head:
         mode=lambda policy: sample(policy, jnp.zeros_like(policy.mean)),
         log_ratio=log_ratio,
         product=product_of_gaussians,
+        propose=propose,
         critics=critics,
         # where tanh is flat no gradient turns an action back: a policy that leans against a wall would stay there
         penalty=lambda policy: jnp.mean(jnp.sum(policy.mean**2, -1)),
@@ -131,6 +147,11 @@ def discrete_head(observation_size: int, num_actions: int) -> Head:
     def sample(logits: Array, noise: Array) -> tuple[Array, Array]:
         action = jnp.argmax(logits + noise, -1).astype(jnp.int32)  # the Gumbel-max trick
         return action, log_ratio(logits, action)
+
+    def propose(policies: Array, key: Array, shape: tuple[int, ...], number: int) -> tuple[Array, Array]:
+        del policies, key, number
+        action = jnp.arange(num_actions, dtype=jnp.int32).reshape(-1, *(1,) * len(shape))
+        return jnp.broadcast_to(action, (num_actions, *shape)), jnp.zeros((num_actions, *shape), jnp.float32)
 
     def critics(network: MLP, params: Any, observation: Array, action: Array) -> Array:
         values = apply_ensemble(network)(params, observation)
@@ -152,6 +173,7 @@ def discrete_head(observation_size: int, num_actions: int) -> Head:
         mode=lambda logits: sample(logits, jnp.zeros_like(logits)),
         log_ratio=log_ratio,
         product=lambda logits: jnp.sum(jax.nn.log_softmax(logits), 0),
+        propose=propose,  # all of them, once
         critics=critics,
         penalty=lambda logits: jnp.zeros((), jnp.float32),
         expect=expect,

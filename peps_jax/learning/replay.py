@@ -26,6 +26,7 @@ def init(capacity: int, observation_size: int, action_space: ActionSpace, percei
         next_observation=numbers(observation_size),
         movement=numbers(perceived_size),
         terminated=jnp.zeros(capacity, bool),
+        human_value=numbers(),
     )
 
 

@@ -93,24 +93,6 @@ def agent_keys(key: Array, number: int) -> list[Array]:
     return [key, *(jax.random.fold_in(key, other) for other in range(1, number))]
 
 
-def acting_policy(agents: tuple[Agent, ...], observation: Array, settings: AgentSettings) -> Any:
-    """The policy that acts: the only agent's own, or the normalised product of several agents' policies."""
-    head, policy_network, _ = networks(settings)
-    policies = [head.policy(policy_network.apply(agent.policy, observation)) for agent in agents]
-    return policies[0] if len(agents) == 1 else head.product(jax.tree.map(lambda *each: jnp.stack(each), *policies))
-
-
-def act(agents: tuple[Agent, ...], observation: Array, key: Array, settings: AgentSettings) -> tuple[Array, Array]:
-    """An action sampled from the acting policy, and l_pi(a|s)."""
-    head = head_of(settings)
-    return head.sample(acting_policy(agents, observation, settings), head.noise(key, observation.shape[:-1]))
-
-
-def mode(agents: tuple[Agent, ...], observation: Array, settings: AgentSettings) -> tuple[Array, Array]:
-    """The acting policy's most likely action before squashing, and l_pi(a|s)."""
-    return head_of(settings).mode(acting_policy(agents, observation, settings))
-
-
 def critic_loss(critics: Any, targets: Array, batch: Transition, settings: AgentSettings) -> Array:
     """Half the squared temporal difference, summed over critics and averaged over the batch."""
     head, _, critic_network = networks(settings)
@@ -118,12 +100,17 @@ def critic_loss(critics: Any, targets: Array, batch: Transition, settings: Agent
     return 0.5 * jnp.sum(jnp.mean((values - targets[None]) ** 2, -1))
 
 
-def critic_targets(agent: Agent, batch: Transition, temperature: Array, noise: Array, settings: AgentSettings) -> Array:
-    """r + gamma (1 - terminated) V(s') by the target critics: bootstraps through a time limit, not through an end."""
+def next_value(agent: Agent, batch: Transition, temperature: Array, noise: Array, settings: AgentSettings) -> Array:
+    """V(s') of the agent's own policy by the target critics."""
     head, policy_network, critic_network = networks(settings)
     policy = head.policy(policy_network.apply(agent.policy, batch.next_observation))
     value, ratio = head.expect(policy, noise, critic_network, agent.targets, batch.next_observation)
-    return batch.reward + settings.gamma * jnp.where(batch.terminated, 0.0, 1.0) * (value - temperature * ratio)
+    return value - temperature * ratio
+
+
+def critic_targets(batch: Transition, value: Array, settings: AgentSettings) -> Array:
+    """r + gamma (1 - terminated) V(s'): bootstraps through a time limit, not through an end."""
+    return batch.reward + settings.gamma * jnp.where(batch.terminated, 0.0, 1.0) * value
 
 
 def policy_loss(
@@ -145,15 +132,25 @@ def target_entropy(space: peps_envs.ActionSpace) -> float:
 
 
 def update(
-    agent: Agent, batch: Transition, temperature: Array, noise: Noise, settings: AgentSettings
+    agent: Agent,
+    batch: Transition,
+    temperature: Array,
+    noise: Noise,
+    settings: AgentSettings,
+    value: Array | None = None,
 ) -> tuple[Agent, dict[str, Array]]:
-    """One step on critics, policy, targets and, if it is tuned, temperature; `batch.reward` in scaled units."""
+    """One step on critics, policy, targets and, if it is tuned, temperature; `batch.reward` in scaled units.
+
+    `value` is V(s') where something else than the agent's own policy acts.
+    """
     chex.assert_equal_shape_prefix([batch.observation, batch.action, batch.next_observation], 1)
     chex.assert_equal_shape([batch.reward, batch.terminated])
     optimizer = optax.adam(settings.learning_rate)
     alpha = jnp.exp(agent.log_temperature) if settings.tune_temperature else temperature
 
-    targets = critic_targets(agent, batch, alpha, noise.targets, settings)
+    if value is None:
+        value = next_value(agent, batch, alpha, noise.targets, settings)
+    targets = critic_targets(batch, value, settings)
     critic_error, critic_grads = jax.value_and_grad(critic_loss)(agent.critics, targets, batch, settings)
     critic_steps, critic_optimizer = optimizer.update(critic_grads, agent.critic_optimizer)
     critics = optax.apply_updates(agent.critics, critic_steps)

@@ -9,7 +9,7 @@ from jax import Array
 
 from peps_envs.registry import unknown_name
 from peps_jax.config import Problem
-from peps_jax.learning import sac
+from peps_jax.learning import sac, team
 from peps_jax.learning.surrogate import SurrogateState
 from peps_jax.preferences.data import PreferenceSet, Segments
 from peps_jax.round import Round
@@ -19,7 +19,7 @@ from peps_jax.trajectory import Trajectory, Transition
 
 def each_acts(agents: tuple[sac.Agent, ...], observation: Array, key: Array, settings: AgentSettings) -> Array:
     """Actions (num_envs, ...) of the acting policy, in every environment."""
-    return sac.act(agents, observation, key, settings)[0]
+    return team.act(agents, observation, key, settings)[0]
 
 
 class Method(NamedTuple):

@@ -48,18 +48,32 @@ def learn(
     return Knowledge(dynamics=dynamics_state, surrogate=surrogate_state), dynamics_info | surrogate_info
 
 
-def reward(knowledge: Knowledge, transitions: Transition, settings: Settings) -> Array:
-    """Eq. (6) without its policy entropy, which is SAC's own: r_A + lambda (r_hat + H_T)."""
-    observation, action, objective = transitions.observation, transitions.action, settings.objective
-    preferred = surrogate.predict(knowledge.surrogate, observation, action, transitions.reward, settings.surrogate)
-    entropy = dynamics.environment_entropy(knowledge.dynamics, observation, action, settings.dynamics)
+def objective(
+    dynamics_state: dynamics.DynamicsState, transitions: Transition, preferred: Array, settings: Settings
+) -> Array:
+    """Eq. (6) without its policy entropy, which is SAC's own: r_A + lambda (preferred + H_T), r-hat being `preferred` (...)."""
+    weights = settings.objective
+    entropy = dynamics.environment_entropy(
+        dynamics_state, transitions.observation, transitions.action, settings.dynamics
+    )
     chex.assert_equal_shape([transitions.reward, preferred, entropy])
     explicable = (
-        objective.surrogate_weight * preferred
-        + objective.environment_entropy_weight * entropy
-        + objective.entropy_offset
+        weights.surrogate_weight * preferred + weights.environment_entropy_weight * entropy + weights.entropy_offset
     )
-    return transitions.reward + objective.lam * explicable
+    return transitions.reward + weights.lam * explicable
+
+
+def reward(knowledge: Knowledge, transitions: Transition, settings: Settings) -> Array:
+    """Eq. (6) with r-hat as it is known."""
+    preferred = surrogate.predict(
+        knowledge.surrogate, transitions.observation, transitions.action, transitions.reward, settings.surrogate
+    )
+    return objective(knowledge.dynamics, transitions, preferred, settings)
+
+
+def entropy_weight(settings: Settings) -> Array:
+    """Eq. (6)'s weight of the policy entropy. SAC's own temperature explores; this comes on top: at lambda = 0 PEPS is SAC."""
+    return settings.objective.lam * settings.objective.policy_entropy_weight
 
 
 PEPS = register(
@@ -69,7 +83,6 @@ PEPS = register(
         uses_lam=True,
         init=init,
         learn=learn,
-        # SAC's own temperature explores; Eq. (6)'s comes on top, so that at lambda = 0 PEPS is SAC
-        entropy_weight=lambda settings: settings.objective.lam * settings.objective.policy_entropy_weight,
+        entropy_weight=entropy_weight,
     )
 )

@@ -13,22 +13,24 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
-from peps_jax.learning import sac
+from peps_jax.learning import sac, team
 from peps_jax.methods import preference_based
 from peps_jax.methods.method import register
 from peps_jax.methods.preference_based import PREFERENCE_BASED
 from peps_jax.settings import AgentSettings
 
 
-def act_in_thirds(agents: tuple[sac.Agent, ...], observation: Array, key: Array, settings: AgentSettings) -> Array:
-    """The product acts in a third of the environments, and each policy alone in another third.
+def behave(agents: tuple[sac.Agent, ...], observation: Array, key: Array, settings: AgentSettings) -> Array:
+    """What acts while they learn: a product of candidates, which the critics value, in every environment.
 
-    SAC goes astray with a policy whose actions it never sees carried out: where only the product acted, the policies' own
-    mistakes were never corrected.
+    A product of Gaussians acts in a third of them, and each policy alone in another third: those policies are valued by what
+    each would do alone, and SAC goes astray with a policy whose actions it never sees carried out.
     """
+    if settings.product == "candidates":
+        return team.act(agents, observation, key, settings)[0]
     teams = [agents, *((agent,) for agent in agents)]
     keys = sac.agent_keys(key, len(teams))
-    actions = [sac.act(team, observation, key, settings)[0] for team, key in zip(teams, keys, strict=True)]
+    actions = [team.act(some, observation, key, settings)[0] for some, key in zip(teams, keys, strict=True)]
     env = jnp.arange(observation.shape[0])
     return jnp.stack(actions, 1)[env, env % len(teams)]
 
@@ -38,6 +40,6 @@ POLICY_SHAPING = register(
         name="policy_shaping",
         rewards=(lambda knowledge, transitions, settings: transitions.reward, preference_based.reward),
         settings=preference_based.from_nothing,
-        behave=act_in_thirds,
+        behave=behave,
     )
 )

@@ -120,6 +120,7 @@ def two_transitions():
     return Transition(
         observation=jnp.zeros((2, 1)), action=jnp.full((2, 1), 0.5), reward=jnp.array([3.0, 3.0]),
         next_observation=jnp.full((2, 1), 0.2), movement=jnp.full((2, 1), 2.0), terminated=jnp.array([True, False]),
+        human_value=jnp.zeros(2),
     )  # fmt: skip
 
 
@@ -133,7 +134,7 @@ def test_critic_targets_by_hand(line):
     head, policy_network, _ = sac.networks(config)
     noise = head.noise(jax.random.key(1), (2,))
     _, ratio = head.sample(head.policy(policy_network.apply(agent.policy, batch.next_observation)), noise)
-    found = sac.critic_targets(agent, batch, temperature, noise, config)
+    found = sac.critic_targets(batch, sac.next_value(agent, batch, temperature, noise, config), config)
     np.testing.assert_allclose(found, [3.0, 3.0 + 0.9 * (5.0 - temperature * ratio[1])], rtol=1e-5)
 
 

@@ -13,14 +13,14 @@ from conftest import LineParams, Probe, ProbeParams, settings
 import peps_jax
 from peps_envs import Box, Discrete
 from peps_jax import Config, methods
-from peps_jax.learning import policy_heads, sac
+from peps_jax.learning import dynamics, policy_heads, sac, team
 from peps_jax.learning.policy_heads import Gaussian
 from peps_jax.methods import Method
 from peps_jax.round import round_at
 from peps_jax.train import collect_and_ask, init, prepare
 from peps_jax.trajectory import Transition
 
-EVERY = ("peps", "sac", "drlhp", "policy_shaping", "human_expectation")
+EVERY = ("peps", "sac", "drlhp", "policy_shaping", "oracle", "human_expectation")
 EPISODES = 6
 
 
@@ -32,16 +32,17 @@ def evaluate():
 def test_the_methods_and_their_order():
     assert tuple(methods.METHODS) == EVERY
     text = Config.__dataclass_fields__["method"].metadata["help"]
-    places = [text.index(name) for name in ("peps", " sac", "drlhp", "policy_shaping", "human_expectation")]
+    places = [text.index(name) for name in ("peps", " sac", "drlhp", "policy_shaping", "oracle", "human_expectation")]
     assert places == sorted(places)
-    assert [name for name in EVERY if methods.get(name).uses_lam] == ["peps"]
+    assert [name for name in EVERY if methods.get(name).uses_lam] == ["peps", "oracle"]
 
 
 def test_absolute_entropies_are_more_by_those_of_what_relative_ones_are_measured_against(tiny):
     problem, method = tiny.problem(), methods.get("peps")
     knowledge = method.init(jax.random.key(0), settings(tiny))
     observation = jnp.zeros(problem.environment.observation_size)
-    step = Transition(observation, jnp.zeros(2), jnp.ones(()), observation, jnp.zeros(2), jnp.zeros((), bool))
+    nothing = jnp.zeros(())
+    step = Transition(observation, jnp.zeros(2), nothing, observation, jnp.zeros(2), jnp.zeros((), bool), nothing)
     reward = lambda kind: method.rewards[0](knowledge, step, settings(tiny.replace(lam=2.0, entropies=kind)))
     absolute, relative = reward("absolute"), reward("relative")
     kernel = distrax.MultivariateNormalDiag(
@@ -160,19 +161,19 @@ def test_products_of_extreme_policies_are_exact(sds):
 def test_one_agent_acts_by_itself_and_two_by_their_product(line, space):
     if space == "discrete":
         line = line.replace(env=Probe(action_space=Discrete(3)), params=ProbeParams(), belief=ProbeParams())
-    own = settings(line).agent
+    own = settings(line.replace(product="gaussians")).agent
     parts, network, _ = sac.networks(own)
     agents = tuple(sac.init(jax.random.key(seed), own) for seed in range(2))
     observations = jnp.linspace(-1.0, 1.0, 5)[:, None]
     each = [parts.policy(network.apply(agent.policy, observations)) for agent in agents]
-    chex.assert_trees_all_equal(sac.acting_policy(agents[:1], observations, own), each[0])
-    together = sac.acting_policy(agents, observations, own)
+    chex.assert_trees_all_equal(team.acting_policy(agents[:1], observations, own), each[0])
+    together = team.acting_policy(agents, observations, own)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
     chex.assert_trees_all_close(together, jax.vmap(parts.product, in_axes=1)(stacked), rtol=1e-5, atol=1e-6)
-    action, ratio = sac.mode(agents, observations, own)
+    action, ratio = team.mode(agents, observations, own)
     np.testing.assert_array_equal(action, parts.mode(together)[0])
     np.testing.assert_allclose(ratio, parts.log_ratio(together, action), rtol=1e-4, atol=1e-5)
-    sampled, ratio = sac.act(agents, observations, jax.random.key(0), own)
+    sampled, ratio = team.act(agents, observations, jax.random.key(0), own)
     np.testing.assert_allclose(ratio, parts.log_ratio(together, sampled), rtol=1e-2, atol=1e-3)
 
 
@@ -188,7 +189,7 @@ def test_every_method_learns_and_acts(line, train, evaluate, method):
     asks = method in ("peps", "drlhp", "policy_shaping")
     assert (result.surrogate is not None) == asks
     assert ("surrogate_loss" in result.curves) == asks
-    assert ("dynamics_loss" in result.curves) == (method == "peps")
+    assert ("dynamics_loss" in result.curves) == (method in ("peps", "oracle"))
     if asks:
         assert int(result.preferences.weight.sum()) == line.num_queries
     evaluation = evaluate(result, num_episodes=EPISODES)
@@ -211,7 +212,9 @@ def test_drlhp_does_not_see_the_environments_reward(line, train):
 
 
 def test_policy_shaping_learns_one_policy_of_each_reward(line, train):
-    line = line.replace(method="policy_shaping", exploration=1.0)  # all actions are random: the same data for both
+    line = line.replace(
+        method="policy_shaping", product="gaussians", exploration=1.0
+    )  # all actions are random: the same data for both
     one, two = (train(line.replace(params=LineParams(slope=slope))).agents for slope in (1.0, -5.0))
     chex.assert_trees_all_equal(one[1], two[1])
     assert not np.allclose(jax.tree.leaves(one[0].critics)[0], jax.tree.leaves(two[0].critics)[0])
@@ -219,8 +222,8 @@ def test_policy_shaping_learns_one_policy_of_each_reward(line, train):
     chex.assert_trees_all_close(one[0], alone, rtol=1e-4, atol=1e-5)
 
 
-def test_policy_shaping_acts_by_the_product(line, train):
-    result = train(line.replace(method="policy_shaping"))
+def test_policy_shaping_acts_by_the_product_of_gaussians(line, train):
+    result = train(line.replace(method="policy_shaping", product="gaussians"))
     head, network, _ = sac.networks(result.training.settings.agent)
     observation = jnp.array([0.3])
     each = [head.policy(network.apply(agent.policy, observation)) for agent in result.agents]
@@ -229,7 +232,7 @@ def test_policy_shaping_acts_by_the_product(line, train):
 
 
 def test_the_product_and_each_policy_act_in_environments_of_their_own(line):
-    line = line.replace(method="policy_shaping", warmup_steps=0, exploration=0.0)
+    line = line.replace(method="policy_shaping", product="gaussians", warmup_steps=0, exploration=0.0)
     training = prepare(line)
     state = init(training)
     agents = []
@@ -249,7 +252,8 @@ def test_the_product_and_each_policy_act_in_environments_of_their_own(line):
 @pytest.mark.parametrize("space", [Box(1), Discrete(3)])
 def test_policy_shaping_behaves_in_thirds(line, space):
     """The product, the first policy and the second one act in every third environment, each with its own chance."""
-    own = settings(line.replace(env=Probe(action_space=space), params=ProbeParams(), belief=ProbeParams())).agent
+    line = line.replace(env=Probe(action_space=space), params=ProbeParams(), belief=ProbeParams())
+    own = settings(line.replace(product="gaussians")).agent
     # outputs of two policies that are sure of opposite actions; of the third one of three neither is
     outputs = ([1.0, -0.5], [-1.0, -0.5]) if space == Box(1) else ([3.0, 0.0, -3.0], [0.0, 3.0, -3.0])
     agents = ()
@@ -263,12 +267,31 @@ def test_policy_shaping_behaves_in_thirds(line, space):
     assert acted.shape == ((3001, 1) if space == Box(1) else (3001,))
     edges = np.linspace(-1, 1, 21) if space == Box(1) else np.arange(4) - 0.5
     share = lambda actions: np.histogram(actions, edges)[0] / actions.size
-    for third, team in enumerate((agents, agents[:1], agents[1:])):
-        expected = np.asarray(sac.act(team, observations, jax.random.key(8), own)[0])
+    for third, some in enumerate((agents, agents[:1], agents[1:])):
+        expected = np.asarray(team.act(some, observations, jax.random.key(8), own)[0])
         np.testing.assert_allclose(share(acted[third::3]), share(expected), atol=0.07)
         assert len(np.unique(acted[third::3])) > 1
     together = methods.get("peps").behave(agents, observations, key, own)
-    np.testing.assert_array_equal(together, sac.act(agents, observations, key, own)[0])
+    np.testing.assert_array_equal(together, team.act(agents, observations, key, own)[0])
+
+
+def test_the_oracle_is_told_what_the_human_thinks(line):
+    """Of l_H = -log(1 + (0.1 / 0.1)^2) / 2, where the belief's mean happens, and r_H = -2 s'; they stand in r-hat's place."""
+    training = prepare(line.replace(method="oracle", belief=LineParams(noise=0.1, slope=-2.0)))
+    state = init(training)
+    now = round_at(jnp.asarray(0), state.key, training.settings.schedule)
+    state, asked, _ = jax.jit(collect_and_ask)(state, now, training)
+    assert asked is None
+    rows = jax.tree.map(lambda rows: rows[: line.steps_per_round], state.replay)
+    expected = -0.5 * math.log(2) - 2.0 * rows.next_observation[:, 0]
+    np.testing.assert_allclose(rows.human_value, expected, rtol=1e-4, atol=1e-5)
+    entropy = dynamics.environment_entropy(
+        state.knowledge.dynamics, rows.observation, rows.action, training.settings.dynamics
+    )
+    np.testing.assert_allclose(
+        training.method.rewards[0](state.knowledge, rows, training.settings),
+        rows.next_observation[:, 0] + line.lam * (expected + entropy), rtol=1e-4, atol=1e-4,
+    )  # fmt: skip
 
 
 def test_the_human_acts_in_the_believed_domain(line, train, evaluate):

@@ -97,8 +97,9 @@ def collected(steps=10, num_envs=3, ends=()):
     place = place[..., None]
     point = Point(place, jnp.zeros((steps, num_envs), jnp.int32))
     transition = Transition(
-        place, jnp.zeros_like(place), jnp.zeros((steps, num_envs)), place + 1, jnp.ones_like(place), terminated
-    )
+        place, jnp.zeros_like(place), jnp.zeros((steps, num_envs)), place + 1, jnp.ones_like(place), terminated,
+        jnp.zeros((steps, num_envs)),
+    )  # fmt: skip
     return Trajectory(transition, over, jnp.zeros((steps, num_envs, 1), bool), point, point)
 
 
