@@ -48,7 +48,7 @@ def measured(file: str, page: Path) -> str:
 
 
 def headline(file: str) -> str:
-    """How often PEPS, SAC and DRLHP arrive in each domain, their scores with intervals, and the planner's explicability."""
+    """How many seeds of PEPS, SAC and DRLHP arrive in each domain, scores with intervals, and the planner's explicability."""
     with open(ROOT / file, encoding="utf-8", newline="") as table_:
         rows = {(row["domain"], row["method"]): row for row in csv.DictReader(table_)}
     domains = [domain for domain, method in rows if method == BEST]
@@ -57,9 +57,15 @@ def headline(file: str) -> str:
         value, low, high = (float(rows[domain, method][f"{score}{end}"]) for end in ("", "_low", "_high"))
         return f"{value:.1f} [{low:.1f}, {high:.1f}]"
 
-    arrived = lambda domain: " / ".join(f"{float(rows[domain, method]['goal_rate']):.0%}" for method, _ in SHOWN)
+    arrived = lambda domain: " / ".join(rows[domain, method]["arrived"] for method, _ in SHOWN)
     scores = (f"{score}, {title}" for score in SCORES for _, title in SHOWN)
-    head = ["domain", f"arrive: {' / '.join(title for _, title in SHOWN)}", *scores, "explicability, planner"]
+    number = rows[domains[0], SHOWN[0][0]]["trained"]
+    head = [
+        "domain",
+        f"arrive, of {number}: {' / '.join(title for _, title in SHOWN)}",
+        *scores,
+        "explicability, planner",
+    ]
     body = [
         [
             domain.removeprefix("nav-").upper(),

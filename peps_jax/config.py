@@ -95,7 +95,7 @@ class Config:
     num_envs: int = static(16, COUNT, "environments side by side", group="run")
     rollout_length: int = static(25, COUNT, "steps that each environment makes in a round", group="run")
     warmup_steps: int = static(
-        3_200, COUNT_OR_NONE, "environment steps with uniformly random actions at the start", group="run"
+        4_800, COUNT_OR_NONE, "environment steps with uniformly random actions at the start", group="run"
     )
     exploration: Any = traced(0.1, SHARE, "share of the steps after that with such actions", group="run")
     hold_steps: int = static(5, COUNT, "steps for which such an action is held", group="run")
@@ -174,6 +174,9 @@ class Config:
     )
     myopia: Any = traced(
         1.0, SHARE, "discount towards a segment's past: below 1 the human weighs its end more", group="human"
+    )
+    informed: Any = traced(
+        0.0, SHARE, "share of the answers by somebody who knows the true dynamics and reward", group="human"
     )
     mistake_rate: Any = traced(0.0, SHARE, "probability of the opposite answer", group="human")
     indifference: Any = traced(0.0, NOT_NEGATIVE, "difference below which the human calls it a tie", group="human")

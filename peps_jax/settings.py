@@ -135,6 +135,7 @@ class HumanSettings:
 
     rationality: Array
     myopia: Array
+    informed: Array
     mistake_rate: Array
     indifference: Array
     skip_below: Array

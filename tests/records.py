@@ -10,7 +10,7 @@ EPISODES = 4
 
 def made_up(value: float, failed: bool = False, horizon: int = 6) -> Record:
     """A record whose every score is `value`."""
-    names = ("return", "explicability", "human_return", "length", "goal_reached")
+    names = ("return", "explicability", "human_return", "length", "goal_reached", "believed_return")
     figures = {name: np.full(EPISODES, value, np.float32) for name in names} | {"length": np.full(EPISODES, 5.0)}
     heat = {
         name: np.linspace(-value, value, 144).reshape(12, 12) ** power for name, power in (("learned", 1), ("true", 3))

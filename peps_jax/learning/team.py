@@ -24,7 +24,8 @@ from peps_jax.learning.sac import Agent, Noise
 from peps_jax.settings import AgentSettings
 from peps_jax.trajectory import Transition
 
-PER_POLICY = 6  # candidates that each policy proposes, and so many come from the uniform policy
+# candidates of each policy, and of the uniform one: few at every sample of a minibatch, more where they act
+TO_LEARN, TO_ACT = 3, 16
 
 
 class Candidates(NamedTuple):
@@ -50,17 +51,22 @@ def acting_policy(agents: tuple[Agent, ...], observation: Array, settings: Agent
 
 
 def candidates(
-    agents: tuple[Agent, ...], critics: tuple[Any, ...], observation: Array, key: Array, settings: AgentSettings
+    agents: tuple[Agent, ...],
+    critics: tuple[Any, ...],
+    observation: Array,
+    key: Array,
+    number: int,
+    settings: AgentSettings,
 ) -> Candidates:
     """What the product exp(sum_j Q_j / alpha) makes of actions that are proposed at `observation` (..., observation_size).
 
-    Candidates x are drawn in equal numbers from every policy and from the uniform one, so their density q relative to the uniform
+    `number` candidates x each are drawn from every policy and from the uniform one, so their density q relative to the uniform
     policy is the mean of theirs. One is drawn with probability proportional to exp(sum_j Q_j / alpha) / q, and the same weights'
     mean estimates the product's normalisation. `settings.temperature` is alpha, in reward units.
     """
     head, _, network = sac.networks(settings)
     policies = policies_of(agents, observation, settings)
-    action, log_proposal = head.propose(policies, key, observation.shape[:-1], PER_POLICY)
+    action, log_proposal = head.propose(policies, key, observation.shape[:-1], number)
     value = lambda params: jnp.min(jax.vmap(lambda one: head.critics(network, params, observation, one))(action), 1)
     values = jnp.stack([value(params) for params in critics])  # (agents, candidates, ...)
     chex.assert_equal_shape([values[0], log_proposal])
@@ -86,7 +92,7 @@ def act(agents: tuple[Agent, ...], observation: Array, key: Array, settings: Age
     """An action drawn from what acts, and l_pi(a|s)."""
     if _by_candidates(agents, settings):
         key_propose, key_choose = jax.random.split(key)
-        offered = candidates(agents, _critics(agents), observation, key_propose, settings)
+        offered = candidates(agents, _critics(agents), observation, key_propose, TO_ACT, settings)
         return _pick(offered, jax.random.categorical(key_choose, offered.log_probability, 0))
     head = sac.head_of(settings)
     return head.sample(acting_policy(agents, observation, settings), head.noise(key, observation.shape[:-1]))
@@ -95,7 +101,7 @@ def act(agents: tuple[Agent, ...], observation: Array, key: Array, settings: Age
 def mode(agents: tuple[Agent, ...], observation: Array, settings: AgentSettings) -> tuple[Array, Array]:
     """What acts at its most likely, before squashing or of always the same candidates, and l_pi(a|s)."""
     if _by_candidates(agents, settings):
-        offered = candidates(agents, _critics(agents), observation, generator.key(0), settings)
+        offered = candidates(agents, _critics(agents), observation, generator.key(0), TO_ACT, settings)
         return _pick(offered, jnp.argmax(offered.log_ratio, 0))
     return sac.head_of(settings).mode(acting_policy(agents, observation, settings))
 
@@ -137,7 +143,7 @@ def _next_values(
         return (None,) * len(agents)
     current = settings.replace(temperature=temperature / settings.reward_scale)
     targets = tuple(agent.targets for agent in agents)
-    offered = candidates(agents, targets, step.batch.next_observation, step.key, current)
+    offered = candidates(agents, targets, step.batch.next_observation, step.key, TO_LEARN, current)
     probability = jnp.exp(offered.log_probability)
     entropy = -jnp.sum(probability * offered.log_ratio, 0)
     values = jnp.sum(probability[None] * offered.values, 1)

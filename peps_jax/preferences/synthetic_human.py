@@ -31,11 +31,11 @@ def log_weight(
     )
 
 
-def segment_values(segments: Segments, problem: Problem, settings: HumanSettings) -> Array:
+def segment_values(
+    segments: Segments, environment: peps_envs.Environment, belief: Any, settings: HumanSettings
+) -> Array:
     """Z of Eq. (2) for each segment, (...): what the human thinks of it, with its end weighed more if it is myopic."""
-    score = lambda state, action, next_state: sum(
-        log_weight(problem.environment, problem.belief, state, action, next_state)
-    )
+    score = lambda state, action, next_state: sum(log_weight(environment, belief, state, action, next_state))
     for _ in segments.mask.shape:
         score = jax.vmap(score)
     values = score(segments.state, segments.action, segments.next_state)
@@ -48,9 +48,13 @@ def segment_values(segments: Segments, problem: Problem, settings: HumanSettings
 def answer(key: Array, queries: Queries, problem: Problem, settings: HumanSettings) -> Answers:
     """The synthetic human's answers to `queries`."""
     key_choice, key_mistake = jax.random.split(key)
-    values = segment_values(queries.segments, problem, settings)
+    chance = lambda key: jax.random.uniform(key, queries.number.shape, jnp.float32)
+    # both at once: one density in the program
+    beliefs = jax.tree.map(lambda *both: jnp.stack(jnp.broadcast_arrays(*both)), problem.belief, problem.params)
+    both = jax.vmap(lambda belief: segment_values(queries.segments, problem.environment, belief, settings))(beliefs)
+    knows = chance(jax.random.fold_in(key, 1)) < settings.informed
+    values = jnp.where(knows[:, None], both[1], both[0])  # (queries, 2)
     difference = values[:, 0] - values[:, 1]
-    chance = lambda key: jax.random.uniform(key, difference.shape, jnp.float32)
     first = chance(key_choice) < jax.nn.sigmoid(settings.rationality * difference)
     mistaken = chance(key_mistake) < settings.mistake_rate
     choice = jnp.where(first ^ mistaken, 1.0, 0.0)

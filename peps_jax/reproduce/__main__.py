@@ -21,7 +21,19 @@ from peps_envs.registry import unknown_name
 from peps_jax.command_line import Command, Parser, called, options
 from peps_jax.config import Config
 from peps_jax.execution.waiting import Reminder
-from peps_jax.reproduce import ablations, answers, figure1, figure2, figure3, frontier, queries, table1
+from peps_jax.reproduce import (
+    ablations,
+    answers,
+    bias,
+    figure1,
+    figure2,
+    figure3,
+    frontier,
+    queries,
+    table1,
+    table1_many,
+    teachers,
+)
 from peps_jax.reproduce.driving.experiment import STEPS
 from peps_jax.reproduce.plan import DOMAINS, FEW_SEEDS, METHODS, Need, Plan, Training
 from peps_jax.reproduce.queries import QUERY_SEEDS
@@ -52,8 +64,11 @@ RESULTS: dict[str, Result] = {
     "figure1": figure1,
     "figure2": figure2,
     "figure3": figure3,
-    "frontier": frontier,
+    "table1_many": table1_many,
     "answers": answers,
+    "frontier": frontier,
+    "teachers": teachers,
+    "bias": bias,
     "queries": queries,
     "ablations": ablations,
 }
@@ -71,9 +86,12 @@ class Request:
 
 def parser() -> Parser:
     """The command line's parser."""
-    texts = "\n".join(f"  {name:10} {result.ABOUT}" for name, result in RESULTS.items())
-    groups = "\n".join(f"  {name:10} {', '.join(members)}" for name, members in GROUPS.items())
-    fewer = f"frontier and ablations take the first {FEW_SEEDS} seeds, queries {QUERY_SEEDS}, answers {answers.SEEDS}."
+    texts = "\n".join(f"  {name:11} {result.ABOUT}" for name, result in RESULTS.items())
+    groups = "\n".join(f"  {name:11} {', '.join(members)}" for name, members in GROUPS.items())
+    fewer = (
+        f"frontier, teachers, bias and ablations take the first {FEW_SEEDS} seeds, queries {QUERY_SEEDS}, "
+        f"answers {answers.SEEDS}."
+    )
     epilog = f"results:\n{texts}\n{groups}\n\n{fewer}"
     made = Parser(PROG, "[RESULT ...] ", description=DESCRIPTION, epilog=epilog)
     made.add_argument("results", nargs="*", default=["paper"], metavar="RESULT", help="what to reproduce [paper]")

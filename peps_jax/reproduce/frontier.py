@@ -11,7 +11,7 @@ import numpy as np
 from peps_jax.analysis.surrogate_maps import rank_correlation
 from peps_jax.drawing.panels import INK, QUIET, colour_of, panels_of, tidy
 from peps_jax.reproduce.plan import BASELINES, DOMAINS, FEW_SEEDS, Need, Plan
-from peps_jax.reproduce.summary import SCORES, TITLES, Line, decimal, estimates, title, write_picture, write_texts
+from peps_jax.reproduce.summary import SCORES, TITLES, Line, decimal, estimates, mean, title, write_picture, write_texts
 from peps_jax.storage.tables import markdown
 
 if TYPE_CHECKING:
@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 ABOUT = "return and explicability over lambda"
 LAMS = (0.0, 0.5, 1.0, 4.0)  # at which PEPS is trained, beside the plan's
 PLANNED_LAMS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # of the planner's curve, beside the plan's
+_INFLATION = """\
+Deceptive inflation: what the human believes PEPS's policy to return (r_H, where the belief is what happens), minus what it
+returns; means over seeds. Below 0 the human thinks less of the agent than it is worth.
+"""
 
 
 def _lams(plan: Plan, others: Sequence[float]) -> list[float]:
@@ -73,7 +77,15 @@ def _table(lines: Sequence[Line]) -> str:
             at = [values.get(lam, np.nan) for lam in lams]
             rising = rank_correlation(np.array(lams), np.array(at)) if np.all(np.isfinite(at)) else np.nan
             rows.append([title(domain), TITLES.get(method, method), *map(decimal, at), decimal(rising, 2)])
-    return markdown(["domain", "explicability at λ", *(f"{lam:g}" for lam in lams), "Spearman"], rows)
+    inflated = []
+    for domain in DOMAINS:
+        own = {line["lam"]: line["inflation"] for line in lines if (line["domain"], line["method"]) == (domain, "peps")}
+        inflated.append([title(domain), *(decimal(own.get(lam)) for lam in lams)])
+    return "\n".join([
+        markdown(["domain", "explicability at λ", *(f"{lam:g}" for lam in lams), "Spearman"], rows),
+        _INFLATION,
+        markdown(["domain", *(f"λ = {lam:g}" for lam in lams)], inflated),
+    ])  # fmt: skip
 
 
 def _plan_point(plan: Plan, domain: str, lam: float) -> Line:
@@ -85,7 +97,9 @@ def _point(plan: Plan, domain: str, method: str, lam: float | None) -> Line:
     """Interquartile means over the seeds, with their intervals."""
     changes = {} if lam is None else {"lam": lam}
     records = plan.records(plan.trainings(domain, method, FEW_SEEDS, **changes))
-    return {"domain": domain, "method": method, "lam": lam} | estimates(records)
+    made = {"domain": domain, "method": method, "lam": lam} | estimates(records)
+    return made | {"believed_return": mean([record.mean("believed_return") for record in records]),
+                   "inflation": mean([record.mean("believed_return") - record.mean("return") for record in records])}  # fmt: skip
 
 
 def _draw(axes: Axes, points: Sequence[Line]) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import peps_envs
@@ -27,7 +28,7 @@ from peps_jax.reproduce.store import ROUTES, Record, Store, episodes, settings_o
 from peps_jax.train import check
 
 DOMAINS = ("nav-d1", "nav-d2", "nav-d3", "nav-d4")
-METHODS = ("peps", "sac", "drlhp", "policy_shaping", "human_expectation")  # Table 1's, and the human's expectation
+METHODS = ("peps", "sac", "drlhp", "policy_shaping", "human_expectation")  # Figure 2's
 BASELINES = ("sac", "drlhp", "policy_shaping")
 FEW_SEEDS = 3  # of what is beside Table 1 and the figures of its trainings
 # of the planner, for each objective: noise acts in the believed dynamics alone, and there a few points would miss its tails
@@ -68,11 +69,12 @@ class Training(NamedTuple):
 
     name: str
     config: Config
+    bias: float = 1.0  # strength of the belief's error
 
     @property
     def recipe(self) -> dict[str, Any]:
-        """What decides its numbers."""
-        return settings_of(self.config)
+        """What decides its numbers; a belief follows from its environment and the strength of its error."""
+        return settings_of(self.config.replace(belief=None)) | ({} if self.bias == 1 else {"bias": self.bias})
 
     def of(self, arrays: Mapping[str, np.ndarray]) -> Record:
         return Record.of(arrays)
@@ -85,15 +87,18 @@ class Planned(NamedTuple):
     objective: str
     lam: float
     gamma: float
+    bias: float = 1.0  # strength of the belief's error
 
     @property
     def name(self) -> str:
-        return f"{self.env}-planner-{self.objective}" + f"-lam{self.lam:g}" * (self.objective == "peps")
+        lam = f"-lam{self.lam:g}" * (self.objective == "peps")
+        return f"{self.env}-planner-{self.objective}{lam}{_told(self.bias)}"
 
     @property
     def recipe(self) -> dict[str, Any]:
         """What decides its numbers."""
-        return self._asdict() | PLANNER[self.objective]
+        told = {name: value for name, value in self._asdict().items() if name != "bias" or value != 1}
+        return told | PLANNER[self.objective]
 
     @property
     def doing(self) -> str:
@@ -106,11 +111,29 @@ class Planned(NamedTuple):
         """The route of the exact plan."""
         start = time.perf_counter()
         task = peps_envs.make(self.env)
-        belief = task.beliefs[task.default_belief]
+        belief = believed(self.env, self.bias)
         asked = task.environment, task.params, belief, self.objective, self.lam, num_episodes
         evaluation = jax.device_get(_plan_and_walk(*asked, gamma=self.gamma, **PLANNER[self.objective]))
         routes = evaluation.perceived[:ROUTES]
         return Record(episodes(evaluation), {}, routes, {}, failed=False, seconds=time.perf_counter() - start)
+
+
+def believed(env: str, bias: float) -> Any:
+    """The default belief about `env`, with its error `bias` times as strong: 0 is the truth, 1 the belief as it is.
+
+    Truth and belief are joined by a line; what isn't negative in truth, such as a probability of being stuck, doesn't become so.
+    """
+    task = peps_envs.make(env)
+
+    def at(truth: Any, belief: Any) -> Any:
+        value = truth + bias * (belief - truth)
+        return jnp.where(truth >= 0, jnp.maximum(value, 0), value)
+
+    return jax.tree.map(at, task.params, task.beliefs[task.default_belief])
+
+
+def _told(bias: float) -> str:
+    return "" if bias == 1 else f"-bias{bias:g}"
 
 
 Score = Callable[[Record], float]
@@ -123,22 +146,27 @@ class Plan:
         self.base, self.seeds, self.num_episodes = base, seeds, num_episodes
         self._records: dict[str, Any] = {}
 
-    def training(self, env: str, method: str, seed: int, **changes: Any) -> Training:
-        """The training of `method` in `env` with `changes` of the plan's settings; changes that change nothing don't count."""
+    def training(self, env: str, method: str, seed: int, bias: float = 1.0, **changes: Any) -> Training:
+        """The training of `method` in `env` with `changes` of the plan's settings; changes that change nothing don't count.
+
+        `bias` is the strength of the belief's error, as in `believed`.
+        """
         changes = {name: value for name, value in changes.items() if getattr(self.base, name) != value}
         told = "".join(f"-{name}-{value}" for name, value in changes.items())
         config = self.base.replace(env=env, method=method, seed=seed, **changes)
-        return Training(f"{env}-{method}{told}-seed{seed}", config)
+        if bias != 1:
+            config = config.replace(belief=believed(env, bias))
+        return Training(f"{env}-{method}{told}{_told(bias)}-seed{seed}", config, bias)
 
     def trainings(self, env: str, method: str, seeds: int | None = None, **changes: Any) -> list[Training]:
         """The trainings of the first `seeds` seeds; of all by default."""
         number = self.seeds if seeds is None else min(seeds, self.seeds)
         return [self.training(env, method, seed, **changes) for seed in range(number)]
 
-    def planned(self, env: str, objective: str, lam: float | None = None) -> Planned:
-        """A planned route, at the plan's lambda by default."""
+    def planned(self, env: str, objective: str, lam: float | None = None, bias: float = 1.0) -> Planned:
+        """A planned route, at the plan's lambda by default, for a belief whose error is `bias` times as strong."""
         lam = self.base.lam if lam is None or objective != "peps" else lam
-        return Planned(env, objective, float(lam), float(self.base.gamma))
+        return Planned(env, objective, float(lam), float(self.base.gamma), float(bias))
 
     def record(self, what: Need) -> Any:
         """What came out of `what`: a `Record` of a training or a planned route."""
@@ -206,11 +234,15 @@ class Plan:
 
 def _reduce(run: FinishedRun, num_episodes: int, seconds: float) -> Record:
     """What is kept of a finished training, its samples' evaluation and r-hat over the map among it."""
+    mode = episodes(run.evaluation)
+    problem = run.training.problem
+    imagined = evaluate(run, num_episodes, problem=problem.replace(params=problem.belief))
+    mode["believed_return"] = np.asarray(imagined.human_return, np.float32)
     heat = {}
     if run.surrogate is not None:
         heat = dict(zip(("learned", "true", "free"), surrogate_values(run), strict=True))
     return Record(
-        mode=episodes(run.evaluation),
+        mode=mode,
         sampled=episodes(evaluate(run, num_episodes, stochastic=True)),
         routes=np.asarray(run.evaluation.perceived[:ROUTES]),
         heat=heat,

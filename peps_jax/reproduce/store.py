@@ -34,7 +34,8 @@ CODE = ("peps_jax.train", "peps_jax.evaluate", "peps_jax.analysis.navigation_pla
 class Record(NamedTuple):
     """What is kept of a training, or of a plan."""
 
-    mode: dict[str, np.ndarray]  # (episodes,) each: return, explicability, ... of the policy's mode
+    # (episodes,) each: return, explicability, ... of the policy's mode, and believed_return, sum r_H in the human's own MDP
+    mode: dict[str, np.ndarray]
     sampled: dict[str, np.ndarray]  # the same of its samples; nothing of a plan
     routes: np.ndarray  # (ROUTES, horizon + 1, 2) positions; the last one is repeated after the end
     heat: dict[str, np.ndarray]  # (rows, columns) each: learned, true, free; nothing without r-hat

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 SCORES = ("return", "explicability")
 TITLES = {
-    "peps": "PEPS", "sac": "SAC", "drlhp": "DRLHP", "policy_shaping": "policy shaping", "human_expectation": "human",
+    "peps": "PEPS", "sac": "SAC", "drlhp": "DRLHP", "policy_shaping": "policy shaping", "oracle": "oracle",
+    "human_expectation": "human",
 }  # fmt: skip
 
 Line = dict[str, Any]  # a line of a CSV file
@@ -83,8 +84,8 @@ def line(domains: Sequence[str], what: str, groups: Sequence[Sequence[Record]], 
         made |= in_columns(score, interval(values))
         pooled = np.concatenate(values)
         made |= {f"{score}_mean": mean(pooled), f"{score}_sd": float(np.std(pooled)) if pooled.size else math.nan}
-    arrived = [record.mean("goal_reached") for record in good]
-    made |= {"goal_rate": mean(arrived), "goal_rate_lowest": min(arrived, default=math.nan)}
+    rates = [record.mean("goal_reached") for record in good]
+    made |= {"arrived": sum(rate > 0.5 for rate in rates), "trained": trained, "goal_rate": mean(rates)}
     made |= {f"sampled_{score}": mean([record.mean(score, sampled=True) for record in good]) for score in SCORES}
     return made
 
@@ -109,25 +110,17 @@ def _estimate(made: Mapping[str, Any], score: str) -> str:
 
 def cells(made: Mapping[str, Any], paper: bool) -> list[str]:
     """A line as a table shows it."""
-    shown = [made["domain"], TITLES.get(made["method"], made["method"]), _seeds(made)]
+    shown = [made["domain"], TITLES.get(made["method"], made["method"]), _arrive(made)]
     for score in SCORES:
         spread = f"{decimal(made[f'{score}_mean'])} ± {decimal(made[f'{score}_sd'])}" if f"{score}_sd" in made else ""
         shown += [_estimate(made, score), spread] + [_paper(made, score)] * paper
-    shown.append(_goal(made))
     sampled = [made.get(f"sampled_{score}") for score in SCORES]
     return [*shown, "" if sampled[0] is None else " / ".join(map(decimal, sampled))]
 
 
-def _goal(made: Mapping[str, Any]) -> str:
-    """The share of episodes that reach the goal, and of the worst seed's where it differs."""
-    share, lowest = decimal(made.get("goal_rate"), 2), decimal(made.get("goal_rate_lowest"), 2)
-    return share if lowest in ("–", share) else f"{share} ({lowest})"
-
-
-def _seeds(made: Mapping[str, Any]) -> str:
-    if "seeds" not in made:
-        return ""
-    return f"{made['seeds']}" + f" ({made['failed']} failed)" * (made["failed"] > 0)
+def _arrive(made: Mapping[str, Any]) -> str:
+    """How many seeds reach the goal by their mode, a training that failed among those that don't."""
+    return f"{made['arrived']} of {made['trained']}" if "arrived" in made else decimal(made.get("goal_rate"), 2)
 
 
 def _paper(made: Mapping[str, Any], score: str) -> str:
@@ -137,10 +130,10 @@ def _paper(made: Mapping[str, Any], score: str) -> str:
 
 def head(paper: bool) -> list[str]:
     """The names of `cells`."""
-    names = ["domain", "method", "seeds"]
+    names = ["domain", "method", "arrive"]
     for score in SCORES:
         names += [f"{score}, IQM [95 %]", "mean ± sd"] + ["paper"] * paper
-    return [*names, "goal (worst seed)", "sampled: return / explicability"]
+    return [*names, "sampled: return / explicability"]
 
 
 def write_texts(folder: Path, contents: Mapping[str, str | bytes]) -> list[Path]:

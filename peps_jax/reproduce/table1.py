@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from peps_jax import methods
 from peps_jax.analysis.intervals import probability_of_improvement
 from peps_jax.reproduce import ways
-from peps_jax.reproduce.plan import BASELINES, DOMAINS, METHODS, Need, Plan
+from peps_jax.reproduce.plan import BASELINES, DOMAINS, Need, Plan, Training
 from peps_jax.reproduce.store import Record
 from peps_jax.reproduce.summary import (
     SCORES,
@@ -30,6 +31,16 @@ from peps_jax.reproduce.summary import (
 from peps_jax.storage.tables import csv_bytes, latex, markdown
 
 ABOUT = "return and explicability of every method"
+MANY = 10  # times as many answers, in the table after it
+ROWS: dict[str, tuple[str, dict[str, Any]]] = {  # method, and what it is changed in
+    "peps": ("peps", {}),
+    "sac": ("sac", {}),
+    "drlhp": ("drlhp", {}),
+    "policy_shaping": ("policy_shaping", {}),
+    "policy shaping, Gaussians": ("policy_shaping", {"product": "gaussians"}),
+    "oracle": ("oracle", {}),
+    "human_expectation": ("human_expectation", {}),
+}
 # Gong and Zhang 2021, Table 1, in the order of `DOMAINS`: averages over 100 rollouts, without intervals
 PAPER = {
     "return": {
@@ -46,25 +57,35 @@ PAPER = {
     },
 }
 _NOTE = """\
-IQM: interquartile mean over seeds, with a 95 % stratified bootstrap interval; {episodes} episodes a seed by the policy's mode,
-"sampled" by its samples. Way: how many seeds go as in the paper's Figure 2, and the way of the planner. Paper: Gong and Zhang
-2021, Table 1. The planner knows dynamics, belief and rewards; "peps" is Eq. (6) at λ = {lam:g}. "human" acts, and is scored, in
-the MDP that the human believes in.
+{answers:,} answers. Arrive: seeds whose mode reaches the goal. IQM: interquartile mean over seeds, with a 95 % stratified
+bootstrap interval; {episodes} episodes a seed by the policy's mode, "sampled" by its samples. Way: how many seeds go as in the
+paper's Figure 2, and the way of the planner. Paper: Gong and Zhang 2021, Table 1. The planner knows dynamics, belief and rewards;
+"peps" is Eq. (6) at λ = {lam:g}. "human" acts, and is scored, in the MDP that the human believes in. The oracle is told ℓ_H + r_H
+in r̂'s place.
 """
 
 
-def needs(plan: Plan) -> list[Need]:
-    """All methods in all domains, and the planner's bounds."""
+def needs(plan: Plan, many: bool = False) -> list[Need]:
+    """All rows in all domains, and the planner's bounds; `many` is the table of `MANY` times as many answers."""
     plans = [plan.planned(domain, objective) for domain in DOMAINS for objective in ("return", "peps", "human")]
-    return plans + [training for domain in DOMAINS for method in METHODS for training in plan.trainings(domain, method)]
+    return plans + [training for domain in DOMAINS for row in ROWS for training in _trainings(plan, domain, row, many)]
 
 
-def write(plan: Plan, folder: Path) -> list[Path]:
-    """table1.{md,csv,tex}, and improvement.csv: how probably a training of PEPS scores higher than one of a baseline."""
-    groups = {method: [plan.records(plan.trainings(domain, method)) for domain in DOMAINS] for method in METHODS}
+def _trainings(plan: Plan, domain: str, row: str, many: bool) -> list[Training]:
+    method, changes = ROWS[row]
+    asked = {"num_queries": plan.base.num_queries * MANY} if many and methods.get(method).asks else {}
+    return plan.trainings(domain, method, **changes, **asked)
+
+
+def write(plan: Plan, folder: Path, many: bool = False) -> list[Path]:
+    """table1.{md,csv,tex}, and improvement.csv: how probably a training of PEPS scores higher than one of a baseline.
+
+    With `many`, table1_many and improvement_many.
+    """
+    groups = {row: [plan.records(_trainings(plan, domain, row, many)) for domain in DOMAINS] for row in ROWS}
     lines = []
     for place, domain in enumerate(DOMAINS):
-        for method in METHODS:
+        for method in ROWS:
             made = line([domain], method, [groups[method][place]], plan.seeds)
             if method in PAPER["return"]:
                 made |= {f"{score}_paper": PAPER[score][method][place] for score in SCORES}
@@ -72,26 +93,34 @@ def write(plan: Plan, folder: Path) -> list[Path]:
                 made["way"] = _as_in_the_paper(domain, method, groups[method][place])
             lines.append(made)
         lines += [_planner_line(plan, domain, objective) for objective in ("return", "peps", "human")]
-    lines += [line(DOMAINS, method, groups[method], plan.seeds * len(DOMAINS)) for method in METHODS]
+    lines += [line(DOMAINS, method, groups[method], plan.seeds * len(DOMAINS)) for method in ROWS]
     improvements = _improvements(groups)
     names, shown = [*head(paper=True), "way"], [[*cells(made, paper=True), made.get("way", "")] for made in lines]
     text = [
         markdown(names, shown),
-        _NOTE.format(episodes=plan.num_episodes, lam=plan.base.lam),
+        _NOTE.format(
+            episodes=plan.num_episodes,
+            lam=plan.base.lam,
+            answers=plan.base.num_queries * (MANY if many else 1),
+        ),
         "Probability that a training of PEPS scores higher than one of the baseline, with its 95 % interval:\n",
         markdown(["domain", "baseline", *SCORES], [_improvement_cells(one) for one in improvements]),
         "Share of the way from SAC's to the planner's explicability, and rank correlation of r̂ and ℓ_H + r_H over the map, means\n"
         "over seeds:\n",
         markdown(
             ["domain", "planner − SAC", "PEPS covers", "rank correlation"],
-            [_covered(plan, domain) for domain in DOMAINS],
+            [
+                _covered(plan, domain, groups["peps"][place], groups["sac"][place])
+                for place, domain in enumerate(DOMAINS)
+            ],
         ),
     ]
+    suffix = "_many" if many else ""
     contents = {
-        "table1.md": "\n".join(text),
-        "table1.csv": csv_bytes(lines),
-        "table1.tex": latex(names, shown),
-        "improvement.csv": csv_bytes(improvements),
+        f"table1{suffix}.md": "\n".join(text),
+        f"table1{suffix}.csv": csv_bytes(lines),
+        f"table1{suffix}.tex": latex(names, shown),
+        f"improvement{suffix}.csv": csv_bytes(improvements),
     }
     return write_texts(folder, contents)
 
@@ -117,9 +146,8 @@ def _improvement_cells(made: Mapping[str, Any]) -> list[str]:
     return [made["domain"], TITLES[made["baseline"]], *shown]
 
 
-def _covered(plan: Plan, domain: str) -> list[str]:
+def _covered(plan: Plan, domain: str, ours: Sequence[Record], base: Sequence[Record]) -> list[str]:
     best = plan.record(plan.planned(domain, "peps")).mean("explicability")
-    ours, base = (plan.records(plan.trainings(domain, method)) for method in ("peps", "sac"))
     reached, from_where = (mean([record.mean("explicability") for record in records]) for records in (ours, base))
     gap = best - from_where
     share = (reached - from_where) / gap if gap > 0 else np.nan

@@ -36,7 +36,7 @@ def test_discrete_actions_are_drawn_by_the_softmax_of_the_summed_values(line):
     agents, observation = agents_of(own), jnp.array([0.4])
     values = worth(agents, jnp.broadcast_to(observation, (3, 1)), jnp.arange(3), own)
     expected = values - np.log(np.exp(values).sum())
-    offered = team.candidates(agents, [agent.critics for agent in agents], observation, jax.random.key(0), own)
+    offered = team.candidates(agents, [agent.critics for agent in agents], observation, jax.random.key(0), 1, own)
     np.testing.assert_array_equal(offered.action, np.arange(3))
     np.testing.assert_allclose(offered.log_probability, expected, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(offered.log_ratio, expected + np.log(3), rtol=1e-4, atol=1e-5)
@@ -53,7 +53,7 @@ def test_continuous_actions_are_drawn_as_if_the_product_were_integrated(own, mon
         policy["params"]["Dense_1"]["bias"] = jnp.array([0.7, 0.0])
         critics = jax.tree.map(lambda leaf, scale=scale: leaf * scale, agent.critics)
         agents.append(agent.replace(policy=policy, critics=critics))
-    monkeypatch.setattr(team, "PER_POLICY", 100)  # the weights are exact as their number grows
+    monkeypatch.setattr(team, "TO_ACT", 100)  # the weights are exact as their number grows
     agents, number = tuple(agents), 2_000
     observations = jnp.full((number, 1), 0.3)
     grid = jnp.linspace(-1, 1, number)[:, None]
@@ -73,7 +73,7 @@ def test_values_of_the_team_add_up_to_those_of_one_reward(own):
     step = _step(own)
     first, second = team._next_values(agents, step, jnp.asarray(ALPHA * own.reward_scale), own)
     targets = [agent.targets for agent in agents]
-    offered = team.candidates(agents, targets, step.batch.next_observation, step.key, own)
+    offered = team.candidates(agents, targets, step.batch.next_observation, step.key, team.TO_LEARN, own)
     probability = np.exp(np.asarray(offered.log_probability, np.float64))
     np.testing.assert_allclose(probability.sum(0), 1.0, rtol=1e-5)
     soft = np.sum(probability * (np.asarray(offered.values).sum(0) - ALPHA * own.reward_scale * offered.log_ratio), 0)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import Point, settings
+from conftest import LineParams, Point, settings
 
 from peps_jax.preferences import synthetic_human, teachers
 from peps_jax.preferences.data import Queries, Segments
@@ -36,7 +36,8 @@ def share_of_first(config, segments, key=0):
 
 
 def values_of(segments, config):
-    return synthetic_human.segment_values(segments, config.problem(), settings(config).human)
+    problem = config.problem()
+    return synthetic_human.segment_values(segments, problem.environment, problem.belief, settings(config).human)
 
 
 def test_log_weight_is_belief_and_reward(line):
@@ -72,6 +73,17 @@ def test_answers_follow_eq_2(line, rationality, mistake_rate):
     error = 4 * np.sqrt(probability * (1 - probability) / REPEATS)
     assert abs(float(jnp.mean(answers.preferred)) - probability) < error
     assert bool(jnp.all(answers.weight == 1))
+
+
+@pytest.mark.parametrize("informed", [0.0, 0.3, 1.0])
+def test_a_share_of_the_answers_is_by_somebody_who_knows_the_truth(line, informed):
+    config = line.replace(informed=informed, belief=LineParams(noise=0.1, slope=-2.0))
+    segments = query([0.0, 0.1], [0.2, 0.1])
+    of = lambda belief: 1 / (1 + np.exp(-float(np.subtract(*values_of(segments, config.replace(belief=belief))[0]))))
+    probability = informed * of(line.params) + (1 - informed) * of(config.belief)
+    assert abs(of(line.params) - of(config.belief)) > 0.1
+    error = 4 * np.sqrt(probability * (1 - probability) / REPEATS)
+    assert abs(float(jnp.mean(share_of_first(config, segments).preferred)) - probability) < error
 
 
 def test_indifference_is_a_tie(line):

@@ -16,9 +16,22 @@ from peps_jax.analysis.intervals import Estimate
 from peps_jax.drawing import panels
 from peps_jax.execution import batches, program
 from peps_jax.reproduce import __main__ as command
-from peps_jax.reproduce import answers, figure1, figure3, frontier, plan, queries, store, summary, table1, ways
+from peps_jax.reproduce import (
+    answers,
+    bias,
+    figure1,
+    figure3,
+    frontier,
+    plan,
+    queries,
+    store,
+    summary,
+    table1,
+    teachers,
+    ways,
+)
 from peps_jax.reproduce.driving import experiment
-from peps_jax.reproduce.plan import DOMAINS, METHODS, Plan
+from peps_jax.reproduce.plan import DOMAINS, Plan, believed
 from peps_jax.reproduce.store import Store
 from peps_jax.storage.tables import latex, markdown
 
@@ -121,6 +134,17 @@ def test_a_change_that_changes_nothing_is_the_same_training(tiny):
     assert other.name == "nav-d1-peps-lam-1.0-seed2"
     assert other.config == plain.config.replace(lam=1.0)
     assert len(made.trainings("nav-d1", "peps", 9)) == 3, "never more seeds than the study's"
+
+
+def test_a_beliefs_error_is_as_strong_as_told():
+    task = peps_envs.make("nav-d3")
+    truth, belief = task.params, task.beliefs[task.default_belief]
+    jax.tree.map(np.testing.assert_array_equal, believed("nav-d3", 0.0), truth)
+    jax.tree.map(lambda one, two: np.testing.assert_allclose(one, two, rtol=1e-6), believed("nav-d3", 1.0), belief)
+    twice = believed("nav-d3", 2.0)
+    np.testing.assert_allclose(twice.ice_gain, truth.ice_gain + 2 * (belief.ice_gain - truth.ice_gain), rtol=1e-6)
+    assert float(twice.sand_stuck) == 0.0, "no probability below 0"
+    np.testing.assert_array_equal(twice.pit, truth.pit)
 
 
 def test_names_tell_recipes_apart(tiny):
@@ -265,15 +289,21 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
     fill(tmp_path, tiny, seeds=3)
     assert call(["all", "--seeds", 3, "--out", tmp_path], tiny) == 0
     written = {path.name for path in tmp_path.iterdir()} - {store.HEAD, store.KEPT}
-    pictures = ("figure1", "figure2", "frontier", "queries", "answers")
-    assert written == {"improvement.csv", "queries.md", "frontier.md", "answers.md"} | {
+    pictures = ("figure1", "figure2", "frontier", "queries", "answers", "bias")
+    texts = {f"{name}.md" for name in ("queries", "frontier", "answers", "bias", "teachers")}
+    assert written == texts | {"improvement.csv", "improvement_many.csv", "teachers.csv"} | {
         f"{name}.{kind}" for name in pictures for kind in ("png", "pdf", "csv")
-    } | {f"{name}.{kind}" for name in ("table1", "ablations") for kind in ("md", "csv", "tex")}
+    } | {f"{name}.{kind}" for name in ("table1", "table1_many", "ablations") for kind in ("md", "csv", "tex")}
     lines = lines_of(tmp_path / "table1.csv")
-    assert len(lines) == len(DOMAINS) * (len(METHODS) + 3) + len(METHODS)
+    assert len(lines) == len(DOMAINS) * (len(table1.ROWS) + 3) + len(table1.ROWS)
     failing = next(line for line in lines if (line["domain"], line["method"]) == ("nav-d1", "drlhp"))
     assert (failing["seeds"], failing["failed"], failing["return_paper"]) == ("2", "1", "74.51")
-    assert "2 (1 failed)" in (tmp_path / "table1.md").read_text(encoding="utf-8")
+    assert failing["arrived"] == "2"
+    assert "| 2 of 3 |" in (tmp_path / "table1.md").read_text(encoding="utf-8"), "one that failed doesn't arrive"
+    assert "200 answers" in (tmp_path / "table1_many.md").read_text(encoding="utf-8")
+    assert {line["bias"] for line in lines_of(tmp_path / "bias.csv")} == {str(bias_) for bias_ in bias.STRENGTHS}
+    assert {line["method"] for line in lines_of(tmp_path / "teachers.csv")} == set(teachers.TEACHERS)
+    assert all(line["inflation"] for line in lines_of(tmp_path / "frontier.csv") if line["method"] == "peps")
     printed = capsys.readouterr().out
     assert "table1.tex" in printed
     assert "figure3 of 4 methods" in printed
@@ -290,7 +320,7 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
 def test_a_stopped_table_continues(tmp_path, capsys, tiny, monkeypatch):
     monkeypatch.setattr(plan, "PLANNER", {name: dict(points=1, resolution=13) for name in plan.PLANNER})
     monkeypatch.setattr(batches, "RUNS_PER_DEVICE", 1)  # two batches
-    monkeypatch.setattr(table1, "METHODS", ("peps", "sac"))
+    monkeypatch.setattr(table1, "ROWS", {name: (name, {}) for name in ("peps", "sac")})
     monkeypatch.setattr(table1, "BASELINES", ("sac",))
     for module in (table1, figure1):
         monkeypatch.setattr(module, "DOMAINS", ("nav-d1",))

@@ -35,6 +35,7 @@ SETTINGS = dict(
     segment_length=HORIZON, num_queries=1, surrogate_learning_rate=2e-3,  # nothing is asked: all was said before
     # answers are many, and r-hat is learned from them alone, as in the paper
     prior="none", exploration=0.2, critic_normalisation=False, learning_rate=1e-3, batch_size=256,
+    product="gaussians",  # of discrete actions
 )  # fmt: skip
 LAMS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)  # over which PEPS is shown
 

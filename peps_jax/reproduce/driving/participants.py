@@ -84,6 +84,7 @@ def manner(participant: Participants) -> HumanSettings:
     return HumanSettings(
         rationality=participant.rationality,
         myopia=number(1.0),
+        informed=number(0.0),
         mistake_rate=number(0.0),
         indifference=number(0.0),
         skip_below=number(-jnp.inf),
