@@ -4,12 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import Line, LineParams
+from conftest import TINY, Line, LineParams
 
 import peps_envs
+from peps_jax import Config
 
 gymnax = pytest.importorskip("gymnax")
 
+from peps_envs.bridges.from_gymnax import from_gymnax  # noqa: E402
 from peps_envs.bridges.to_gymnax import GymnaxEnvironment  # noqa: E402
 
 # --- ours in gymnax -------------------------------------------------------------------------------------------------------
@@ -94,3 +96,123 @@ def test_spaces():
     observation, _ = env.reset(jax.random.key(0), env.default_params)
     assert bool(space.contains(observation))
     assert space.shape == observation.shape
+
+
+# --- gymnax's with beliefs ------------------------------------------------------------------------------------------------
+
+
+def pendulum(**changes):
+    env, params = gymnax.make("Pendulum-v1")
+    pose = lambda state: jnp.stack([jnp.cos(state.theta), jnp.sin(state.theta)])
+    return from_gymnax(env, params, pose, width=(0.1, 0.1), **changes), params
+
+
+def mountain_car(**changes):
+    env, params = gymnax.make("MountainCarContinuous-v0")
+    return from_gymnax(env, params, lambda state: state.position[None], width=(0.005,), **changes), params
+
+
+@pytest.mark.parametrize("make", [pendulum, mountain_car])
+def test_random_steps_are_gymnaxs_bit_by_bit(make):
+    """20 000, of 100 walks at once."""
+    environment, params = make()
+    env = environment.env
+    scale = 2.0 if make is pendulum else 1.0  # the largest torque
+
+    def walk(step, start, key):
+        key_start, key_moves = jax.random.split(key)
+
+        def move(state, key):
+            key_act, key_step = jax.random.split(key)
+            state, *seen = step(key_step, state, jax.random.uniform(key_act, (1,), minval=-1.0))
+            return state, seen
+
+        return jax.lax.scan(move, start(key_start), jax.random.split(key_moves, 200))[1]
+
+    def ours(key, state, action):
+        after = environment.step(key, state, action, params)
+        return after.state, after.observation, after.reward, after.terminated, after.state.inner
+
+    def theirs(key, state, action):
+        observation, after, reward, terminated, _ = env.step_env(key, state, scale * action, params)
+        return jax.tree.map(jnp.asarray, after), observation, reward, terminated, after
+
+    def their_start(key):
+        return env.reset_env(key, params)[1].replace(time=jnp.int32(0))
+
+    keys = jax.random.split(jax.random.key(0), 100)
+    found, expected = (
+        jax.jit(jax.vmap(lambda key, step=step, start=start: walk(step, start, key)))(keys)
+        for step, start in ((ours, lambda key: environment.reset(key, params)[0]), (theirs, their_start))
+    )
+    for mine, their in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_array_equal(mine, their)
+
+
+@pytest.mark.parametrize(("make", "changes"), [(pendulum, {"m": 2.0}), (mountain_car, {"power": 0.003})])
+def test_a_training_with_a_belief(make, changes, train):
+    environment, params = make()
+    config = Config(env=environment, params=params, belief=params.replace(**changes), **TINY)
+    result = train(config)
+    assert np.all(np.isfinite(result.curves["explicability"]))
+    state, _ = environment.reset(jax.random.key(1), params)
+    action = jnp.ones(1)
+    perceived = environment.perceive(environment.step(jax.random.key(0), state, action, params).state)
+    expects = lambda params: environment.next_state_distribution(state, action, params).relative_log_prob(perceived)
+    assert expects(params) == 0
+    assert expects(params.replace(**changes)) < -1e-5
+
+
+def test_the_time_limit_truncates_and_the_goal_terminates():
+    environment, params = mountain_car()
+    assert environment.horizon == 999
+    state, _ = environment.reset(jax.random.key(0), params)
+    step = jax.jit(lambda state: environment.step(jax.random.key(0), state, jnp.ones(1), params))
+    late = step(state.replace(time=jnp.int32(998)))
+    assert (bool(late.terminated), bool(late.truncated)) == (False, True)
+    there = step(state.replace(inner=state.inner.replace(position=jnp.float32(0.44), velocity=jnp.float32(0.05))))
+    assert (bool(there.terminated), bool(there.truncated)) == (True, False)
+    assert there.reward > 99
+
+
+def test_a_human_wants_what_is_paid_unless_it_is_said():
+    flat = lambda state, action, after, params: after.position * params.power
+    for environment, params in (mountain_car(), mountain_car(reward=flat)):
+        state, _ = environment.reset(jax.random.key(0), params)
+        after = environment.step(jax.random.key(0), state, jnp.ones(1), params)
+        judged = environment.reward(state, jnp.ones(1), after.state, params.replace(power=1.0))
+        ratio = 1.0 if environment.reward_of is None else 1 / params.power
+        np.testing.assert_allclose(judged, after.reward * ratio, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "complaint"),
+    [
+        ("Breakout-MinAtar", r"^Breakout-MinAtar: observations of shape \(10, 10, 4\), such as pixels, .*`observe`"),
+        ("MemoryChain-bsuite", r"^MemoryChain-bsuite: observations hide 'context' of the state, .*`observe`$"),
+        ("PointRobot-misc", r"^PointRobot-misc: observations hide 'goal' of the state, .*`observe`$"),
+    ],
+)
+def test_what_cannot_work_is_said_in_one_line(name, complaint):
+    env, params = gymnax.make(name)
+    with jax.numpy_rank_promotion("allow"), pytest.raises(ValueError, match=complaint):
+        from_gymnax(env, params, lambda state: jnp.zeros(1), width=(1.0,))
+
+
+def test_observations_of_ones_own():
+    env, params = gymnax.make("PointRobot-misc")
+    both = lambda state: jnp.concatenate([state.pos, state.goal])
+    with jax.numpy_rank_promotion("allow"):
+        environment = from_gymnax(env, params, lambda state: state.pos, width=(0.1, 0.1), observe=both)
+        state, observation = environment.reset(jax.random.key(0), params)
+    np.testing.assert_array_equal(observation, both(state.inner))
+    environment, params = pendulum()
+    with pytest.raises(ValueError, match=r"observations hide 'theta_dot' of the state"):
+        pendulum(observe=environment.see)
+
+
+def test_parameters_of_another_kind_are_refused_in_one_line():
+    environment, _ = pendulum()
+    _, other = gymnax.make("CartPole-v1")
+    with pytest.raises(ValueError, match=r"^Pendulum-v1: parameters of another structure \(EnvParams for EnvParams\)"):
+        environment.reset(jax.random.key(0), other)
