@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from peps_envs import pictures
 from peps_envs.navigation import NavigationParams
 from peps_envs.navigation.scene import ground
 from peps_envs.scene import Rectangle
-from peps_jax.drawing import scenes
-from peps_jax.drawing.panels import INK, QUIET, colour, colour_of
+from peps_jax.drawing.panels import INK, QUIET, colour_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,14 +25,14 @@ def draw_map(axes: Axes, params: NavigationParams, heat: bool = False) -> None:
     On a `heat` map ice and sand are outlines, for the heat to be seen.
     """
     arena = ground(params)
-    scenes.frame(axes, arena)
+    pictures.frame(axes, arena)
     for spine in axes.spines.values():
-        spine.set(visible=True, color=colour("wall"), linewidth=2.5)
+        spine.set(visible=True, color=pictures.colour("wall"), linewidth=2.5)
     floor, *areas = arena.shapes
     if not heat:
-        scenes.add(axes, (floor, *areas))
+        pictures.add(axes, (floor, *areas))
         return
-    scenes.add(axes, [area for area in areas if area.colour in SOLID])
+    pictures.add(axes, [area for area in areas if area.colour in SOLID])
     for area in areas:
         if area.colour not in SOLID:
             _outline(axes, area)

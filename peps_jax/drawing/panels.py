@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from peps_envs.pictures import ROLES as ROLES
 from peps_jax import methods
 from peps_jax.storage import files
 
@@ -19,24 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-INK, QUIET = "#2b2b2b", "#8a8a8a"
-ROLES = {  # the colours of what a scene shows, see `peps_envs.scene`; CSS knows them too
-    "ink": INK,
-    "quiet": QUIET,
-    "floor": "#fbfaf7",
-    "wall": "#4a4a4a",
-    "pit": "#9c5a33",
-    "goal": "#57a773",
-    "ice": "#a9d3f0",
-    "sand": "#f6e3a1",
-    "firm sand": "#dfb94f",
-    "road": "#d9d9d6",
-    "edge line": QUIET,
-    "lane line": "#ffffff",
-    "agent": "#2f9e78",
-    "other": "#1c6dd0",
-    "wreck": "#c2255c",
-}
+INK, QUIET = ROLES["ink"], ROLES["quiet"]
 # of methods, in the order they are registered
 COLOURS = ("#c2255c", "#1c6dd0", "#e8890c", "#2f9e78", "#7048b6", "#5c6770")
 DOTS = 200  # per inch
@@ -70,11 +54,6 @@ def legend_below(figure: Figure, axes: Axes) -> None:
     """What `axes` shows, as one row under all panels."""
     handles, texts = axes.get_legend_handles_labels()
     figure.legend(handles, texts, frameon=False, fontsize=8, loc="outside lower center", ncols=len(texts))
-
-
-def colour(role: str) -> str:
-    """The colour of a role in a scene; any other colour is itself."""
-    return ROLES.get(role, role)
 
 
 def colour_of(method: str) -> str:

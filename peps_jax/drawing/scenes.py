@@ -14,15 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from peps_envs import Environment
-from peps_envs.scene import Circle, Polyline, Rectangle, Scene, Shape, Text
-from peps_jax.drawing.panels import INK, colour, panels_of
+from peps_envs.pictures import draw as draw
+from peps_envs.scene import Scene
+from peps_jax.drawing.panels import INK, panels_of
 from peps_jax.preferences.data import Segments
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-OUTLINE, LINE = 0.6, 1.2  # points, widths of lines
 TITLE = 0.45  # inches between one scene and the next, for what is written there
 
 
@@ -58,52 +57,6 @@ def between(before: Any, after: Any, share: float) -> Any:
             return np.where(old == new, old, (1 - share) * np.asarray(old, float) + share * np.asarray(new, float))
 
     return jax.tree.map(mix, before, after)
-
-
-def draw(axes: Axes, scene: Scene) -> None:
-    """`scene` in place of all that was on `axes`."""
-    axes.clear()
-    frame(axes, scene)
-    add(axes, scene.shapes)
-
-
-def frame(axes: Axes, scene: Scene) -> None:
-    """The view of `scene`, without its shapes: limits, background, no ticks."""
-    left, right, low, high = scene.extent
-    bottom, top = (high, low) if scene.y_down else (low, high)
-    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
-    axes.set_facecolor(colour(scene.background))
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-
-
-def add(axes: Axes, shapes: Sequence[Shape]) -> None:
-    """`shapes` over one another in their order, above heat maps (0) and below what is drawn on top (from 2 on)."""
-    for place, shape in enumerate(shapes):
-        _add(axes, shape, 1 + place / len(shapes))
-
-
-def _add(axes: Axes, shape: Shape, order: float) -> None:
-    from matplotlib import patches
-
-    match shape:
-        case Rectangle():
-            corner = (shape.x - shape.width / 2, shape.y - shape.height / 2)
-            turned = dict(angle=np.degrees(shape.angle), rotation_point="center", zorder=order)
-            axes.add_patch(patches.Rectangle(corner, shape.width, shape.height, **turned, **_style(shape)))
-        case Circle():
-            axes.add_patch(patches.Circle((shape.x, shape.y), shape.radius, zorder=order, **_style(shape)))
-        case Polyline():
-            axes.plot(*np.transpose(shape.points), color=colour(shape.colour), linewidth=LINE, zorder=order)
-        case Text():
-            style = dict(ha="center", va="center", fontsize=7, clip_on=True, zorder=order)
-            axes.text(shape.x, shape.y, shape.text, color=colour(shape.colour), **style)
-
-
-def _style(shape: Rectangle | Circle) -> dict[str, Any]:
-    if shape.outline is None:
-        return dict(facecolor=colour(shape.colour), linewidth=0)
-    return dict(facecolor=colour(shape.colour), edgecolor=colour(shape.outline), linewidth=OUTLINE)
 
 
 def strips(clips: Mapping[str, Sequence[Scene]], labels: Sequence[str], note: str = "") -> Figure:

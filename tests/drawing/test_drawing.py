@@ -11,6 +11,7 @@ from conftest import LineParams, Point, untrained
 from matplotlib.colors import to_hex
 
 import peps_envs
+from peps_envs.pictures import OUTLINE, picture
 from peps_envs.scene import Circle, Polyline, Rectangle, Scene, Text
 from peps_jax import evaluate, methods
 from peps_jax.drawing import navigation_map, panels, scenes
@@ -60,13 +61,21 @@ def test_a_scene_is_drawn_as_it_is_described():
     corners = box.get_patch_transform().transform(box.get_path().vertices)
     np.testing.assert_allclose(corners.min(0), (1.5, 0.0), atol=1e-6)  # turned around its centre
     np.testing.assert_allclose(corners.max(0), (2.5, 2.0), atol=1e-6)
-    assert (box.get_linewidth(), disc.get_linewidth()) == (scenes.OUTLINE, 0)
+    assert (box.get_linewidth(), disc.get_linewidth()) == (OUTLINE, 0)
     (line,), (text,) = axes.lines, axes.texts
     np.testing.assert_array_equal(line.get_xydata(), [[0, 0], [4, 2]])
     assert text.get_text() == "here"
     order = [artist.get_zorder() for artist in (box, disc, line, text)]
     assert order == sorted(order)
     assert len(set(order)) == 4
+
+
+def test_a_picture_is_the_view_and_nothing_around_it():
+    shown = picture(Scene(SHAPES[1:2], SCENE.extent, y_down=True, background="road"), pixels=200)
+    assert (shown.shape, shown.dtype) == ((100, 200, 3), np.uint8)
+    colour = lambda x, y: "#" + "".join(f"{part:02x}" for part in shown[y, x])
+    assert [colour(x, y) for x, y in ((0, 0), (199, 99), (120, 50))] == [panels.ROLES["road"]] * 3
+    assert colour(50, 50) == "#123456"
 
 
 def test_drawing_anew_replaces_what_was_there():

@@ -1,0 +1,156 @@
+"""What environments share that are made of another ecosystem's simulator: what is carried, and what is checked at the door.
+
+The simulator is code, what it is told (parameters, a system, a compiled model) is data: the true one and the believed one are two
+values of one structure, so that one program serves both.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from peps_envs.environment import ActionSpace, Bounds, Discrete, Environment, Step
+
+
+@struct.dataclass
+class SimulatedState:
+    """The simulator's own state, and what the last step was worth."""
+
+    inner: Any
+    reward: Array  # () of the step that led here
+    time: Array  # () int, steps since the start
+
+
+@dataclasses.dataclass(frozen=True)
+class Structure:
+    """What all values of the parameters share: the tree with everything in it that isn't an array, and the arrays' shapes."""
+
+    tree: Any
+    shapes: tuple[tuple[int, ...], ...]
+
+    def check(self, params: Any, whose: str) -> None:
+        """Raises ValueError, in one line that says where `params` differ."""
+        if Structure.of(params) != self:
+            other = jax.tree.unflatten(self.tree, self.shapes)
+            raise ValueError(f"{whose}: parameters of another structure ({_difference(other, params)}) need another program; "
+                             "give all of them the same one")  # fmt: skip
+
+    @classmethod
+    def of(cls, params: Any) -> Structure:
+        return cls(jax.tree.structure(params), tuple(jnp.shape(leaf) for leaf in jax.tree.leaves(params)))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Simulator(Environment):
+    """An environment whose steps another ecosystem makes.
+
+    Attributes:
+      see: (the simulator's state) -> what people compare of it, (perceived_size,).
+      width: sigma_p of that.
+      reward_of: (state, action, next state, parameters) -> reward. None: what the simulator paid for the step, whoever judges it.
+      structure: of all its parameters.
+      name: of the simulator, for messages.
+    """
+
+    horizon: int
+    observation_size: int
+    action_space: ActionSpace
+    observation_space: Bounds
+    random_draws: int
+    see: Callable[[Any], Array]
+    width: tuple[float, ...]
+    reward_of: Callable[[Any, Array, Any, Any], Array] | None
+    structure: Structure
+    name: str
+
+    @abc.abstractmethod
+    def start(self, key: Array, params: Any) -> tuple[Any, Array]:
+        """The simulator's state at the start, and its observation."""
+
+    @abc.abstractmethod
+    def advance(self, key: Array, inner: Any, action: Array, params: Any) -> tuple[Any, Array, Array, Array]:
+        """The simulator's next state, its observation, what it pays, and whether the MDP ended."""
+
+    def reset(self, key: Array, params: Any) -> tuple[SimulatedState, Array]:
+        self.structure.check(params, self.name)
+        inner, observation = self.start(key, params)
+        action = jax.eval_shape(self._still)
+        after, seen, reward, _ = jax.eval_shape(self.advance, key, inner, action, params)
+        # simulators start from Python's numbers, and from scalars where they go on with arrays
+        inner = jax.tree.map(_as, inner, after)
+        return SimulatedState(inner, jnp.zeros((), reward.dtype), jnp.zeros((), jnp.int32)), _as(observation, seen)
+
+    def step(self, key: Array, state: SimulatedState, action: Array, params: Any) -> Step:
+        self.structure.check(params, self.name)
+        inner, observation, reward, terminated = self.advance(key, state.inner, action, params)
+        inner = jax.tree.map(_as, inner, state.inner)
+        if self.reward_of is not None:
+            reward = self.reward_of(state.inner, action, inner, params)
+        after = SimulatedState(inner, jnp.asarray(reward, state.reward.dtype).reshape(()), state.time + 1)
+        terminated = jnp.asarray(terminated, bool).reshape(())
+        truncated = (after.time >= self.horizon) & ~terminated
+        return Step(after, observation, after.reward, terminated, truncated, jnp.zeros(0, bool))
+
+    def reward(self, state: SimulatedState, action: Array, next_state: SimulatedState, params: Any) -> Array:
+        if self.reward_of is None:
+            return next_state.reward
+        return jnp.asarray(self.reward_of(state.inner, action, next_state.inner, params)).reshape(())
+
+    def perceive(self, state: SimulatedState) -> Array:
+        return self.see(state.inner)
+
+    def perception_width(self, params: Any) -> Array:
+        return jnp.asarray(self.width)
+
+    def _still(self) -> Array:
+        """An action, for its shape."""
+        if isinstance(self.action_space, Discrete):
+            return jnp.zeros((), jnp.int32)
+        return jnp.zeros(self.action_space.size)
+
+
+def _as(leaf: Any, like: Any) -> Array:
+    return jnp.asarray(leaf, like.dtype).reshape(like.shape)
+
+
+def check_flat(observation: Any, name: str) -> None:
+    """Raises ValueError for observations that no small network takes in."""
+    leaves = jax.tree.leaves(observation)
+    if not (len(leaves) == 1 and leaves[0] is observation):
+        raise ValueError(
+            f"{name}: observations in parts aren't supported; give `observe`, which makes one vector of a state"
+        )
+    if observation.ndim != 1:
+        raise ValueError(
+            f"{name}: observations of shape {observation.shape}, such as pixels, aren't supported; give `observe`, "
+            "which makes one vector of a state"
+        )
+
+
+def _difference(wanted: Any, given: Any) -> str:
+    """Names of the fields in which two parameter sets differ that aren't arrays' contents."""
+    if type(wanted) is not type(given):
+        return f"{type(given).__name__} for {type(wanted).__name__}"
+    if not dataclasses.is_dataclass(wanted):
+        return "its tree or the shapes of its arrays"
+    names = []
+    for field in dataclasses.fields(wanted):
+        one, other = getattr(wanted, field.name), getattr(given, field.name)
+        if isinstance(one, tuple) and hasattr(other, "shape"):
+            same = one == other.shape
+        elif isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
+            same = np.array_equal(one, other)
+        elif dataclasses.is_dataclass(one):
+            same = jax.tree.structure(one) == jax.tree.structure(other)
+        else:
+            same = Structure.of(one) == Structure.of(other) or one is other
+        names += [] if same else [field.name]
+    return ", ".join(names[:4]) or "a field that isn't an array"
