@@ -4,10 +4,10 @@
     push = from_mjx(heavy, reward, perceive=lambda data: data.qpos, width=(0.05, 0.05))
     train(Config(env=push, params=push.model(heavy), belief=push.model(light)))
 
-A belief about masses or sizes is a second model that MuJoCo has compiled. Replacing a mass in a compiled one leaves what was derived
-from it as it was, such as the inverse weights by which contacts are softened: that isn't the heavier one, and `model` refuses it.
-Both models have one structure, so that one program serves both; what is NumPy in an `mjx.Model`, such as which geoms may touch, is
-part of the program, and models that differ in it are refused.
+A belief about masses or sizes is a second model that MuJoCo has compiled. Replacing a mass in a compiled one leaves what was
+derived from it as it was, such as the inverse weights by which contacts are softened: that isn't the heavier one, and `model`
+refuses it. Both models have one structure, so that one program serves both; what is NumPy in an `mjx.Model`, such as which geoms
+may touch, is part of the program, and models that differ in it are refused.
 """
 
 from __future__ import annotations
