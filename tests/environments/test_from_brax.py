@@ -20,6 +20,9 @@ with warnings.catch_warnings():  # a library that Brax imports announces its ret
     from peps_envs.bridges.from_brax import from_brax
 
 
+# as programs are compiled outside of tests; otherwise the last bit depends on what else is in a program
+OPTIMIZED = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
+
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Brax System:UserWarning"),  # it says who maintains it
     pytest.mark.filterwarnings("ignore:Accessing `:DeprecationWarning"),  # how Brax uses MJX
@@ -57,7 +60,7 @@ def test_random_steps_are_braxs_bit_by_bit(make):
         own.sys = system
         return own.step(state.replace(metrics=dict(state.metrics)), action)
 
-    batched = lambda step: jax.jit(jax.vmap(step, (0, 0, None)))
+    batched = lambda step: jax.jit(jax.vmap(step, (0, 0, None)), compiler_options=OPTIMIZED)
     mine = batched(lambda state, action, system: environment.step(jax.random.key(0), state, action, system))
     theirs = batched(theirs)
     keys = jax.random.split(jax.random.key(0), 100)
