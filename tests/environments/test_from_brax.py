@@ -49,7 +49,8 @@ def _lenient():
         yield
 
 
-@pytest.mark.parametrize("make", [reacher, pytest.param(hopper, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [reacher, hopper])
 def test_random_steps_are_braxs_bit_by_bit(make):
     """20 000, of 100 walks at once."""
     environment, _ = make()
