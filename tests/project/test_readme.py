@@ -49,7 +49,8 @@ def shortened(code: str) -> str:
     return re.sub(r"(evaluate\(result(?:, config)?), \d+\)", r"\1, 2)", code)
 
 
-WITH_PYTHON = [page for page in EXECUTED if python_of(page)]
+# what needs other ecosystems runs in test_bridges_page.py, where they are installed
+WITH_PYTHON = [page for page in EXECUTED if python_of(page) and page.stem != "bridges"]
 
 
 @pytest.mark.slow

@@ -38,7 +38,7 @@ class Structure:
 
     def check(self, params: Any, whose: str) -> None:
         """Raises ValueError, in one line that says where `params` differ."""
-        if Structure.of(params) != self:
+        if self.of(params) != self:
             other = jax.tree.unflatten(self.tree, self.shapes)
             raise ValueError(f"{whose}: parameters of another structure ({_difference(other, params)}) need another program; "
                              "give all of them the same one")  # fmt: skip
@@ -144,13 +144,17 @@ def _difference(wanted: Any, given: Any) -> str:
     names = []
     for field in dataclasses.fields(wanted):
         one, other = getattr(wanted, field.name), getattr(given, field.name)
-        if isinstance(one, tuple) and hasattr(other, "shape"):
-            same = one == other.shape
-        elif isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
+        if isinstance(one, np.ndarray):
             same = np.array_equal(one, other)
-        elif dataclasses.is_dataclass(one):
-            same = jax.tree.structure(one) == jax.tree.structure(other)
+        elif isinstance(one, tuple) and hasattr(other, "shape"):  # an array, of which the shape is kept
+            same = one == other.shape
+        elif isinstance(one, int | float | str | bytes | bool):
+            same = one == other
         else:
-            same = Structure.of(one) == Structure.of(other) or one is other
+            same = jax.tree.structure(one, is_leaf=_is_shape) == jax.tree.structure(other)
         names += [] if same else [field.name]
     return ", ".join(names[:4]) or "a field that isn't an array"
+
+
+def _is_shape(value: Any) -> bool:
+    return isinstance(value, tuple) and all(isinstance(part, int) for part in value)

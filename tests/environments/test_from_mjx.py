@@ -1,0 +1,222 @@
+"""MuJoCo models with beliefs: roll-outs beside MuJoCo's own, masses that can't be replaced, and what can't work."""
+
+import copy
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import TINY
+
+from peps_envs.scene import Circle, Scene
+from peps_jax import Config
+
+mujoco = pytest.importorskip("mujoco")
+mjx = pytest.importorskip("mujoco.mjx")
+
+from peps_envs.bridges.from_mjx import from_mjx  # noqa: E402
+
+PUSH = """
+<mujoco model="push">
+  <option timestep="0.01" tolerance="1e-10"/>
+  <worldbody>
+    <body name="pusher">
+      <joint name="x" type="slide" axis="1 0 0" damping="4"/>
+      <joint name="y" type="slide" axis="0 1 0" damping="4"/>
+      <geom name="hand" type="sphere" size="0.1" mass="1"/>
+    </body>
+    <body name="ball" pos="0.4 0.02 0">
+      <joint name="u" type="slide" axis="1 0 0" damping="1" frictionloss="0.5"/>
+      <joint name="v" type="slide" axis="0 1 0" damping="1" frictionloss="0.5"/>
+      <geom name="ball" type="sphere" size="0.15" mass="{mass}" contype="{contype}"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor joint="x" gear="20" ctrlrange="-1 1"/>
+    <motor joint="y" gear="20" ctrlrange="-2 2"/>
+  </actuator>
+</mujoco>"""
+STEPS = 100
+
+
+def compiled(mass, contype=1):
+    return mujoco.MjModel.from_xml_string(PUSH.format(mass=mass, contype=contype))
+
+
+def far(data, action, after, model):
+    return after.xpos[2, 0] - data.xpos[2, 0] - 0.01 * jnp.sum(action**2)
+
+
+def draw(model, data):
+    ball = Circle(*map(float, data.geom("ball").xpos[:2]), float(model.geom("ball").size[0]), "other")
+    return Scene((ball,), (-1.0, 2.0, -1.0, 1.0))
+
+
+@pytest.fixture(autouse=True)
+def _lenient():
+    with jax.numpy_rank_promotion("allow"):  # MJX mixes ranks
+        yield
+
+
+@functools.cache
+def push(**changes):
+    settings = dict(horizon=STEPS, scene=draw) | changes
+    return from_mjx(compiled(5.0), far, lambda data: data.xpos[2, :2], (0.02, 0.02), **settings)
+
+
+def controls(steps=STEPS):
+    """Ahead, with some wobbling, so that the ball is hit more than once."""
+    times = np.arange(steps)[:, None]
+    return np.concatenate([np.where(times % 50 < 40, 1.0, -1.0), 0.2 * np.sin(times / 5)], 1)
+
+
+def rolled_out(environment, params, actions):
+    """Positions after each action, (steps, nq)."""
+
+    @jax.jit
+    def run(params, actions):
+        state, _ = environment.reset(jax.random.key(0), params)
+        step = lambda state, action: (environment.step(jax.random.key(0), state, action, params).state,) * 2
+        return jax.lax.scan(step, state, actions)[1].inner.qpos
+
+    return np.asarray(run(params, actions))
+
+
+def in_mujoco(model, actions):
+    data, places = mujoco.MjData(model), []
+    for action in actions:
+        data.ctrl[:] = action * model.actuator_ctrlrange[:, 1]
+        mujoco.mj_step(model, data)
+        places.append(data.qpos.copy())
+    return np.array(places)
+
+
+@pytest.mark.parametrize("mass", [5.0, 1.0])
+def test_a_roll_out_is_mujocos_of_the_model_that_was_compiled_with_that_mass(mass):
+    expected = in_mujoco(compiled(mass), controls())
+    assert expected[-1, 2] > 0.05, "the ball is hit"
+    with jax.enable_x64(True):
+        environment = push()
+        exact = rolled_out(environment, environment.model(compiled(mass)), controls())
+    np.testing.assert_allclose(exact, expected, atol=1e-6)
+    np.testing.assert_allclose(rolled_out(push(), push().model(compiled(mass)), controls()), expected, atol=2e-3)
+
+
+def test_a_mass_cannot_be_replaced_in_a_compiled_model():
+    """MuJoCo's own model is refused; in MJX's it moves otherwise than what has been compiled."""
+    environment = push()
+    replaced = compiled(1.0)
+    replaced.body_mass[2] = 5.0
+    with pytest.raises(
+        ValueError, match=r"^push: body_subtreemass, .* don't follow from its masses and sizes; compile a"
+    ):
+        environment.model(replaced)
+    with jax.enable_x64(True):
+        light, heavy = environment.model(compiled(1.0)), environment.model(compiled(5.0))
+        alone = light.replace(body_mass=heavy.body_mass)
+        both = alone.replace(body_inertia=heavy.body_inertia)
+        expected = in_mujoco(compiled(5.0), controls())
+        for model in (alone, both):
+            assert np.abs(rolled_out(environment, model, controls()) - expected).max() > 1e-4
+
+
+def test_friction_may_be_replaced():
+    environment = push()
+    sticky = compiled(5.0)
+    sticky.dof_frictionloss[2:] = 2.0
+    moved = rolled_out(environment, environment.model(sticky), controls())
+    np.testing.assert_allclose(moved, in_mujoco(sticky, controls()), atol=2e-3)
+
+
+def test_random_steps_are_mjxs_bit_by_bit():
+    """20 000, of 200 walks at once."""
+    environment = push()
+    model = environment.model(compiled(5.0))
+    step = jax.jit(jax.vmap(lambda state, action: environment.step(jax.random.key(0), state, action, model)))
+    theirs = jax.jit(jax.vmap(lambda data, action: mjx.step(model, data.replace(ctrl=action * jnp.array([1.0, 2.0])))))
+    states = jax.vmap(lambda key: environment.reset(key, model)[0])(jax.random.split(jax.random.key(0), 200))
+    data = jax.vmap(lambda _: mjx.make_data(compiled(5.0), impl="jax"))(jnp.arange(200))
+    for key in jax.random.split(jax.random.key(1), 100):
+        action = jax.random.uniform(key, (200, 2), minval=-1.0)
+        states, data = step(states, action).state, theirs(data, action)
+        for name in ("qpos", "qvel", "qacc_warmstart"):
+            np.testing.assert_array_equal(getattr(states.inner, name), getattr(data, name))
+
+
+def test_what_is_seen_and_paid_is_of_the_pose_after_the_step():
+    environment = push()
+    model, action = environment.model(compiled(5.0)), jnp.array([1.0, 0.0])
+    step = jax.jit(lambda state: environment.step(jax.random.key(0), state, action, model))
+    state, observation = environment.reset(jax.random.key(0), model)
+    assert observation.shape == (environment.observation_size,) == (8,)
+    for _ in range(60):
+        before, state = state, step(state).state
+    ball = np.array([0.4, 0.02]) + state.inner.qpos[2:]
+    assert ball[0] > 0.45
+    np.testing.assert_allclose(environment.perceive(state), ball, rtol=1e-5)
+    moved = state.inner.qpos[2] - before.inner.qpos[2]
+    np.testing.assert_allclose(state.reward, moved - 0.01, atol=1e-5)
+    np.testing.assert_allclose(environment.reward(before, action, state, model), state.reward, atol=1e-6)
+    (drawn,) = environment.scene(jax.device_get(state), model).shapes
+    np.testing.assert_allclose([drawn.x, drawn.y, drawn.radius], [*ball, 0.15], rtol=1e-5)
+
+
+def test_a_belief_expects_what_the_other_model_does():
+    environment = push()
+    heavy, light = (environment.model(compiled(mass)) for mass in (5.0, 1.0))
+    action = jnp.array([1.0, 0.0])
+    step = jax.jit(lambda state, model: environment.step(jax.random.key(0), state, action, model).state)
+
+    @jax.jit
+    def surprise(state, after, model):
+        return environment.next_state_distribution(state, action, model).relative_log_prob(environment.perceive(after))
+
+    state, _ = environment.reset(jax.random.key(0), heavy)
+    found = []
+    for _ in range(60):
+        after = step(state, heavy)
+        found.append([surprise(state, after, heavy), surprise(state, after, light)])
+        state = after
+    knows, believes = np.array(found).T
+    assert np.all(knows > -1e-6)
+    assert believes.min() < -0.01
+
+
+@pytest.mark.slow
+def test_a_training_with_a_belief(train):
+    environment = push()
+    heavy, light = (environment.model(compiled(mass)) for mass in (5.0, 1.0))
+    result = train(Config(env=environment, params=heavy, belief=light, **TINY))
+    assert np.all(np.isfinite(result.curves["explicability"]))
+
+
+def test_starts_and_ends_of_ones_own():
+    def start(key, data):
+        return data.replace(qpos=data.qpos.at[0].set(jax.random.uniform(key, (), minval=-1.0, maxval=-0.5)))
+
+    environment = push(start=start, terminated=lambda data: data.qpos[0] < -0.4, substeps=3)
+    model = environment.model(compiled(5.0))
+    (one, _), (other, _) = (environment.reset(jax.random.key(seed), model) for seed in (0, 1))
+    assert one.inner.qpos[0] != other.inner.qpos[0]
+    after = jax.jit(environment.step)(jax.random.key(0), one, jnp.zeros(2), model)
+    assert bool(after.terminated)
+    np.testing.assert_allclose(after.state.inner.time, 0.03, rtol=1e-5)
+
+
+def test_what_cannot_work_is_said_in_one_line():
+    environment = push()
+    with pytest.raises(
+        ValueError, match=r"^push: parameters of another structure \(body_contype, geom_contype.*\) need another progr"
+    ):
+        environment.model(compiled(5.0, contype=2))
+    with pytest.raises(
+        ValueError, match=r"^push: observations hide qvel, on which what follows depends; let `observe`"
+    ):
+        push(observe=lambda data: data.xpos[1:, :2].reshape(-1))
+    with pytest.raises(ValueError, match=r"^push: observations of shape \(8, 8, 3\), such as pixels, aren't supported"):
+        push(observe=lambda data: jnp.zeros((8, 8, 3)))
+    unlimited = copy.copy(compiled(5.0))
+    unlimited.actuator_ctrllimited[:] = 0
+    with pytest.raises(ValueError, match=r"^push: every actuator needs a ctrlrange, to which actions"):
+        from_mjx(unlimited, far, lambda data: data.qpos, (1.0,))
