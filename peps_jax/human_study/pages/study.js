@@ -1,0 +1,495 @@
+// The participants' page. The server knows where a participant is; the page asks it, shows that, and sends what was said.
+
+import { Refused, call, identity, token } from "./api.js";
+import { Player } from "./player.js";
+
+const $ = (id) => document.getElementById(id);
+const FLASH = 180; // ms for which one sees what one has chosen
+const POLL = 3; // s, the longest time between two questions of one who waits
+const ENOUGH = { frames: 25, width: 600, height: 480 }; // frames a second, pixels
+const MEASURED = 1500; // ms for which frames are counted
+const MEANINGS = ["not important", "slightly important", "important", "very important", "most important"];
+
+let view = null; // what all clips share
+let player = null; // of what is on the screen
+let press = () => false; // what a key does here, true if anything
+let visit = 0; // counts what was shown: what was begun before is over
+
+// --- what is sent -----------------------------------------------------------------------------------------------------------
+
+let troubled = 0;
+
+function trouble(is, text) {
+  troubled += is ? 1 : -1;
+  if (is) $("trouble").textContent = text;
+  $("trouble").hidden = !is;
+}
+
+const ask = (path) => call(path, undefined, (is) => trouble(is, "Connection lost. Trying again …"));
+
+/**
+ * Sends something and keeps it until the server has it. History entries outlive a reload, belong to this address with its token,
+ * and are there inside a platform's frame, where cookies and storage may not be.
+ */
+async function send(path, body) {
+  history.replaceState({ kept: { path, body } }, "");
+  try {
+    return await call(path, body, (is) => trouble(is, "Connection lost. Your answer is kept, trying again …"));
+  } finally {
+    history.replaceState(null, "");
+  }
+}
+
+/** Sends what was kept when the page was closed; if it isn't wanted any more, it had arrived. */
+async function sendKept() {
+  const kept = history.state?.kept;
+  if (!kept) return;
+  try {
+    await send(kept.path, kept.body);
+  } catch (error) {
+    if (!(error instanceof Refused)) throw error;
+  }
+}
+
+// --- where we are -----------------------------------------------------------------------------------------------------------
+
+async function begin() {
+  if (!token()) {
+    refuse("The address is incomplete. Please open the whole link that you were given.");
+    return;
+  }
+  await guarded(async () => {
+    await sendKept();
+    go(await ask("/api/state"));
+  });
+}
+
+/** Does `action`, and what has to be done if the server says no. */
+async function guarded(action) {
+  try {
+    await action();
+  } catch (error) {
+    if (!(error instanceof Refused)) throw error;
+    if (error.status === 409) {
+      // said in another tab, or before a reload: go on from where the server is
+      announce("This one was answered in another window.");
+      await guarded(async () => go(await ask("/api/state")));
+    } else if (error.status === 429) {
+      refuse("Too many attempts with links that don’t work. Please try again in a few minutes.", error.message);
+    } else if (error.status === 401 || error.status === 403) {
+      refuse("Please open the link again as it was given to you, or ask who gave it to you.", error.message);
+    } else {
+      refuse("Something went wrong. Please load the page again; your answers are safe.", error.message);
+    }
+  }
+}
+
+function refuse(text, why = "") {
+  $("refused-title").textContent = why && !text.startsWith("Please") ? "That didn’t work" : "This link doesn’t work";
+  $("refused-text").textContent = text;
+  $("refused-why").textContent = why;
+  turnTo("refused");
+}
+
+const PAGES = { consent, check, instructions, importance, pairs, ratings, wait, done };
+
+/** Shows where `state` says that the participant is; what is done there begins a chain of its own. */
+function go(state) {
+  $("title").textContent = state.title;
+  document.title = state.title;
+  guarded(() => PAGES[state.page](state));
+}
+
+/** Shows one page and hides the others; returns whether a later step still belongs to it. */
+function turnTo(page) {
+  const here = ++visit;
+  player?.stop();
+  player = null;
+  press = () => false;
+  const watching = page === "pairs" || page === "ratings";
+  const before = document.querySelector("section:not([hidden])");
+  for (const section of document.querySelectorAll("section")) section.hidden = section.dataset.page !== page;
+  if (!watching) $("progress").hidden = true;
+  $("practice-mark").hidden = true;
+  const section = document.querySelector(`section[data-page="${page}"]`);
+  if (before !== section) {
+    scrollTo(0, 0);
+    section.querySelector("h1")?.focus({ preventScroll: true });
+  }
+  return () => here === visit;
+}
+
+function paragraphs(box, texts) {
+  const made = (text) => Object.assign(document.createElement("p"), { textContent: text });
+  box.replaceChildren(...texts.map(made));
+}
+
+function progress(done, total, text) {
+  $("progress").hidden = false;
+  $("progress-bar").max = Math.max(total, 1);
+  $("progress-bar").value = done;
+  $("progress-text").textContent = text;
+}
+
+function announce(text) {
+  for (const id of ["pair-hint", "scene-hint"]) $(id).textContent = text;
+}
+
+function enable(buttons, can) {
+  for (const button of buttons) button.setAttribute("aria-disabled", String(!can));
+}
+
+const can = (button) => button.getAttribute("aria-disabled") !== "true";
+
+/** Lets `button` do `action` once: further clicks until it has ended do nothing. */
+function onClick(button, action) {
+  button.onclick = async () => {
+    if (!can(button)) return;
+    enable([button], false);
+    await guarded(action);
+    enable([button], true);
+  };
+}
+
+const pause = (time) => new Promise((resolve) => setTimeout(resolve, time));
+
+// --- consent, check, instructions, importance -------------------------------------------------------------------------------
+
+function consent(state) {
+  turnTo("consent");
+  paragraphs($("consent-text"), state.texts.consent);
+  const platform = Object.fromEntries(new URLSearchParams(location.search));
+  const preview = platform.assignmentId === "ASSIGNMENT_ID_NOT_AVAILABLE";
+  $("preview-note").hidden = !preview;
+  for (const id of ["agree", "decline"]) $(id).hidden = preview;
+  $("decline-sure").hidden = true;
+  const say = async (agreed) => go(await send("/api/consent", { agreed, platform }));
+  onClick($("agree"), () => say(true));
+  onClick($("decline-yes"), () => say(false));
+  $("decline").onclick = () => {
+    $("decline-sure").hidden = false;
+    $("decline-no").focus();
+  };
+  $("decline-no").onclick = () => {
+    $("decline-sure").hidden = true;
+    $("agree").focus();
+  };
+}
+
+async function check() {
+  const there = turnTo("check");
+  const report = {};
+  onClick($("check-on"), async () => go(await send("/api/proceed", { page: "check", report })));
+  onClick($("check-again"), () => check());
+  enable([$("check-on")], false);
+  $("check-again").hidden = $("check-advice").hidden = true;
+  const items = ["Picture", "Window", "Keys or touch"].map((text) => {
+    const item = document.createElement("li");
+    item.textContent = text;
+    return item;
+  });
+  $("checks").replaceChildren(...items);
+  const touch = matchMedia("(pointer: coarse)").matches;
+  Object.assign(report, {
+    frames_per_second: await framesPerSecond(there),
+    width: innerWidth,
+    height: innerHeight,
+    pixel_ratio: Math.round(100 * devicePixelRatio) / 100,
+    touch,
+  });
+  if (!there()) return;
+  const smooth = report.frames_per_second >= ENOUGH.frames;
+  const large = report.width >= ENOUGH.width && report.height >= ENOUGH.height;
+  const told = [
+    [smooth, `Picture: ${report.frames_per_second} frames a second`],
+    [large, `Window: ${report.width} by ${report.height} pixels`],
+    [true, touch ? "Touch: you will answer with buttons" : "Keys: you can answer with the arrow keys or with buttons"],
+  ];
+  told.forEach(([good, text], place) => {
+    items[place].dataset.good = good;
+    items[place].textContent = text;
+  });
+  const advice = [];
+  if (!smooth) advice.push("The picture isn’t smooth. Closing other programs and tabs may help.");
+  if (!large) advice.push("The window is small. Please make it larger, or turn the tablet on its side.");
+  $("check-advice").textContent = advice.join(" ");
+  $("check-advice").hidden = !advice.length;
+  $("check-again").hidden = !advice.length;
+  enable([$("check-on")], true);
+  $("check-on").focus();
+}
+
+/** Frames a second of a dot that moves, counted while the page is visible. */
+function framesPerSecond(there) {
+  const canvas = $("check-canvas");
+  const dots = devicePixelRatio || 1;
+  canvas.width = canvas.clientWidth * dots;
+  canvas.height = canvas.clientHeight * dots;
+  const context = canvas.getContext("2d");
+  return new Promise((resolve) => {
+    let frames = 0;
+    let time = 0;
+    let last = null;
+    const tick = (now) => {
+      if (!there()) return;
+      if (document.visibilityState === "visible" && last !== null) {
+        time += now - last;
+        frames += 1;
+      }
+      last = document.visibilityState === "visible" ? now : null;
+      const [width, height, radius] = [canvas.width, canvas.height, 11 * dots];
+      context.clearRect(0, 0, width, height);
+      context.fillStyle = "#2f9e78";
+      context.beginPath();
+      context.arc(radius * 2 + (width - 4 * radius) * Math.min(time / MEASURED, 1), height / 2, radius, 0, 2 * Math.PI);
+      context.fill();
+      if (time >= MEASURED) resolve(Math.round((1000 * frames) / time));
+      else requestAnimationFrame(tick);
+    };
+    requestAnimationFrame(tick);
+  });
+}
+
+function instructions(state) {
+  turnTo("instructions");
+  paragraphs($("instructions-text"), state.texts.instructions);
+  const rates = state.phase === "testing";
+  $("keys-pairs").hidden = rates;
+  $("keys-ratings").hidden = !rates;
+  onClick($("practise"), () => practise(state));
+}
+
+async function practise(state) {
+  const [practice] = await Promise.all([ask("/api/practice"), lookAround()]);
+  for (const [place, pair] of practice.pairs.entries()) {
+    await (state.phase === "testing" ? rated : compared)(
+      { place: place + 1, total: practice.pairs.length, clip: pair.left, ...pair },
+      "Practice",
+    );
+  }
+  turnTo("ready");
+  onClick($("read-again"), () => instructions(state));
+  onClick($("begin"), async () => go(await send("/api/proceed", { page: "instructions", report: {} })));
+}
+
+function importance(state) {
+  turnTo("importance");
+  const form = $("importance");
+  const request = identity();
+  $("importance-items").replaceChildren(...state.importance.map(importanceOf));
+  const groups = [...form.querySelectorAll("fieldset")];
+  const chosen = (group) => group.querySelector("input:checked");
+  const all = () => enable([$("importance-on")], groups.every(chosen));
+  all();
+  form.onchange = all;
+  form.onsubmit = (event) => event.preventDefault();
+  const answer = (group, place) => Number(chosen(group).value);
+  onClick($("importance-on"), async () => {
+    const answers = Object.fromEntries(state.importance.map((item, place) => [item.name, answer(groups[place])]));
+    go(await send("/api/importance", { answers, request }));
+  });
+  press = (key) => {
+    if (!/^[1-5]$/.test(key)) return false;
+    const at = groups.find((group) => group.contains(document.activeElement)) ?? groups.find((group) => !chosen(group));
+    if (!at) return false;
+    at.querySelector(`input[value="${key}"]`).checked = true;
+    all();
+    const next = groups[groups.indexOf(at) + 1];
+    (next ? (chosen(next) ?? next.querySelector("input")) : $("importance-on")).focus();
+    return true;
+  };
+}
+
+function importanceOf(item, place) {
+  const group = document.createElement("fieldset");
+  const text = Object.assign(document.createElement("legend"), { textContent: item.text });
+  const steps = Object.assign(document.createElement("div"), { className: "steps" });
+  MEANINGS.forEach((meaning, step) => {
+    const label = document.createElement("label");
+    const input = Object.assign(document.createElement("input"), { type: "radio", name: `item-${place}`, value: step + 1 });
+    input.setAttribute("aria-label", `${step + 1}, ${meaning}`);
+    label.append(input, String(step + 1));
+    steps.append(label);
+  });
+  const ends = Object.assign(document.createElement("div"), { className: "ends" });
+  ends.setAttribute("aria-hidden", "true");
+  const end = (meaning) => Object.assign(document.createElement("span"), { textContent: meaning });
+  ends.append(end(MEANINGS[0]), end(MEANINGS.at(-1)));
+  group.append(text, steps, ends);
+  return group;
+}
+
+// --- pairs and ratings ------------------------------------------------------------------------------------------------------
+
+async function lookAround() {
+  view ??= await ask("/api/view");
+}
+
+async function pairs() {
+  const [pair] = await Promise.all([ask("/api/pair"), lookAround()]);
+  if (await over(pair)) return;
+  const said = await compared(pair);
+  const reply = await send("/api/answer", { place: pair.place, choice: said.choice, ...said.report });
+  go(reply.state);
+}
+
+async function ratings() {
+  const [scene] = await Promise.all([ask("/api/scene"), lookAround()]);
+  if (await over(scene)) return;
+  const said = await rated(scene);
+  const { frames, ...report } = said.report;
+  const reply = await send("/api/rating", { place: scene.place, rating: said.choice, frames: frames.clip, ...report });
+  go(reply.state);
+}
+
+/** Whether there is nothing to show now; then it goes on with what there is instead. */
+async function over(reply) {
+  if (reply.wait === undefined && !reply.done) return false;
+  if (reply.done) go(await ask("/api/state"));
+  else await wait({ seconds_to_wait: reply.wait });
+  return true;
+}
+
+const CHOICES = { ArrowLeft: "left", ArrowRight: "right", ArrowDown: "equal", ArrowUp: "unclear" };
+
+/** Shows a pair until somebody has chosen: { choice, report }. */
+function compared(pair, practice = null) {
+  const buttons = Object.fromEntries(Object.values(CHOICES).map((choice) => [choice, $(choice)]));
+  return chosen({
+    page: "pairs",
+    what: "Pair",
+    named: { left: pair.left, right: pair.right },
+    buttons,
+    choiceOf: (key) => CHOICES[key],
+    bar: $("pair-time"),
+    replay: $("pair-replay"),
+    place: pair.place,
+    total: pair.total,
+    practice,
+  });
+}
+
+/** The same of a single scene. */
+function rated(scene, practice = null) {
+  const numbers = [...Array(10).keys()].map((place) => place + 1);
+  if (!$("ratings").children.length) {
+    $("ratings").append(...numbers.map((number) => Object.assign(document.createElement("button"), { textContent: number })));
+    $("ratings").children[0].setAttribute("aria-label", "1, not at all");
+    $("ratings").children[9].setAttribute("aria-label", "10, exactly");
+  }
+  const buttons = Object.fromEntries(numbers.map((number) => [number, $("ratings").children[number - 1]]));
+  return chosen({
+    page: "ratings",
+    what: "Scene",
+    named: { clip: scene.clip },
+    buttons,
+    choiceOf: (key) => (/^[0-9]$/.test(key) ? Number(key) || 10 : undefined),
+    bar: $("scene-time"),
+    replay: $("scene-replay"),
+    place: scene.place,
+    total: scene.total,
+    practice,
+  });
+}
+
+const CANVAS = { left: "left-clip", right: "right-clip", clip: "scene-clip" };
+
+function chosen({ page, what, named, buttons, choiceOf, bar, replay, place, total, practice }) {
+  const there = turnTo(page);
+  const request = identity();
+  const names = Object.keys(named);
+  const every = Object.values(buttons);
+  const both = names.length > 1;
+  progress(place - 1, total, `${practice ? "Practice" : what} ${place} of ${total}`);
+  $("practice-mark").hidden = !practice;
+  for (const button of every) button.classList.remove("chosen");
+  enable(every, false);
+  enable([replay], true);
+  announce(both ? "Watch both clips to their end." : "Watch the clip to its end.");
+  const stages = names.map((name) => {
+    const canvas = $(CANVAS[name]);
+    canvas.setAttribute("aria-label", both ? `The ${name} clip` : "The clip");
+    return { canvas, box: canvas.parentElement };
+  });
+  return new Promise((resolve) => {
+    const mine = new Player(stages, view, Object.values(named), {
+      onSeen: () => {
+        enable(every, true);
+        announce("Now choose. You may watch again as often as you like.");
+      },
+      onTime: (share) => (bar.style.transform = `scaleX(${share})`),
+    });
+    player = mine;
+    let said = false;
+    const choose = async (choice) => {
+      if (said || !there()) return;
+      if (!mine.seen) {
+        announce(both ? "First watch both clips to their end." : "First watch the clip to its end.");
+        return;
+      }
+      said = true;
+      const frames = Object.fromEntries(names.map((name, number) => [name, mine.frames[number]]));
+      const report = { ...mine.report(), frames, request };
+      enable([...every, replay], false);
+      buttons[choice].classList.add("chosen");
+      announce("");
+      await pause(FLASH);
+      mine.stop();
+      resolve({ choice: both ? choice : Number(choice), report });
+    };
+    const again = () => {
+      if (!said && there()) mine.replay();
+    };
+    for (const [choice, button] of Object.entries(buttons)) button.onclick = () => choose(choice);
+    replay.onclick = again;
+    press = (key) => {
+      if (key === "r" || key === "R") again();
+      else if (choiceOf(key) !== undefined) choose(choiceOf(key));
+      else return false;
+      return true;
+    };
+    mine.start();
+  });
+}
+
+// --- wait, done -------------------------------------------------------------------------------------------------------------
+
+async function wait(state) {
+  const there = turnTo("wait");
+  const seconds = state.seconds_to_wait ?? POLL;
+  $("wait-time").textContent = state.seconds_to_wait > POLL ? `About ${Math.ceil(seconds)} seconds.` : "";
+  await pause(1000 * Math.min(Math.max(seconds, 0.2), POLL));
+  if (there()) go(await ask("/api/state"));
+}
+
+function done(state) {
+  const declined = state.code === null && state.progress.done < state.progress.total;
+  turnTo(declined ? "declined" : "done");
+  paragraphs($("thanks-text"), state.texts.thanks);
+  $("code-box").hidden = state.code === null;
+  $("code").textContent = state.code ?? "";
+  $("copy").onclick = async () => {
+    try {
+      await navigator.clipboard.writeText(state.code);
+      $("copy").textContent = "Copied";
+    } catch {
+      getSelection().selectAllChildren($("code"));
+      $("copy").textContent = "Selected: copy it with Ctrl+C";
+    }
+  };
+}
+
+// --- keys, other tabs, the back button --------------------------------------------------------------------------------------
+
+addEventListener("keydown", (event) => {
+  if (event.repeat || event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return;
+  if (press(event.key)) event.preventDefault();
+});
+
+addEventListener("pageshow", (event) => {
+  if (event.persisted) location.reload();
+});
+
+addEventListener("hashchange", () => location.reload());
+
+begin();
