@@ -42,16 +42,16 @@ def _watch(agents: tuple, problem: Problem, settings: AgentSettings, key: Array,
     return whole(rollout.collect(actors, act, key_steps, problem, alone)[1])
 
 
-def draw(result: Result, note: str) -> Figure:
-    """What the agent does now and, where positions can be mapped, what r-hat has learned so far."""
+def draw(result: Result, note: str) -> tuple[Figure, Segments]:
+    """What the agent does now, and where positions can be mapped what r-hat has learned so far; and the scene that is shown."""
     scene = jax.tree.map(lambda rows: np.asarray(rows)[0], watch(result, generator.key(result.config.seed), 1))
     if isinstance(result.training.problem.environment, Navigation):
-        return _maps(result, scene, note)
+        return _maps(result, scene, note), scene
     problem = result.training.problem
     states = drawing.states_of(scene)
     times = np.linspace(0, int(np.sum(scene.mask)), MOMENTS)
     clip = drawing.scenes_of(problem.environment, problem.params, states, times)
-    return drawing.strips({"the agent now": clip}, [f"step {time:g}" for time in times], note)
+    return drawing.strips({"the agent now": clip}, [f"step {time:g}" for time in times], note), scene
 
 
 def _maps(result: Result, scene: Segments, note: str) -> Figure:
