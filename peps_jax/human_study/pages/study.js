@@ -4,10 +4,13 @@ import { Refused, call, identity, token } from "./api.js";
 import { Player } from "./player.js";
 
 const $ = (id) => document.getElementById(id);
+const WIDE = 3; // times its height, a scene that lies in a strip
 const FLASH = 180; // ms for which one sees what one has chosen
 const POLL = 3; // s, the longest time between two questions of one who waits
 const ENOUGH = { frames: 25, width: 600, height: 480 }; // frames a second, pixels
 const MEASURED = 1500; // ms for which frames are counted
+const PLATFORMS = ["PROLIFIC_PID", "STUDY_ID", "SESSION_ID", "workerId", "assignmentId", "hitId", "turkSubmitTo"];
+const PREVIEW = "ASSIGNMENT_ID_NOT_AVAILABLE"; // MTurk's, while somebody only looks
 const MEANINGS = ["not important", "slightly important", "important", "very important", "most important"];
 
 let view = null; // what all clips share
@@ -158,12 +161,23 @@ const pause = (time) => new Promise((resolve) => setTimeout(resolve, time));
 function consent(state) {
   turnTo("consent");
   paragraphs($("consent-text"), state.texts.consent);
-  const platform = Object.fromEntries(new URLSearchParams(location.search));
-  const preview = platform.assignmentId === "ASSIGNMENT_ID_NOT_AVAILABLE";
-  $("preview-note").hidden = !preview;
+  const address = new URLSearchParams(location.search);
+  const platform = Object.fromEntries([...address].filter(([name, text]) => PLATFORMS.includes(name) && text));
+  const preview = Object.values(platform).includes(PREVIEW);
+  note(preview ? "This is a preview. Accept the task on the platform to take part." : "");
   for (const id of ["agree", "decline"]) $(id).hidden = preview;
   $("decline-sure").hidden = true;
-  const say = async (agreed) => go(await send("/api/consent", { agreed, platform }));
+  const say = async (agreed) => {
+    try {
+      const { token: own, ...reply } = await send("/api/consent", { agreed, platform });
+      if (own) enter(own);
+      go(reply);
+    } catch (error) {
+      // what the server wants to be told to whoever reads this page: no id of the platform, nothing to rate yet
+      if (!(error instanceof Refused) || ![400, 409].includes(error.status)) throw error;
+      note(error.message);
+    }
+  };
   onClick($("agree"), () => say(true));
   onClick($("decline-yes"), () => say(false));
   $("decline").onclick = () => {
@@ -174,6 +188,16 @@ function consent(state) {
     $("decline-sure").hidden = true;
     $("agree").focus();
   };
+}
+
+function note(text) {
+  $("consent-note").textContent = text;
+  $("consent-note").hidden = !text;
+}
+
+/** From now on this is the address, with a token of the participant's own; a platform's ids have done their work. */
+function enter(own) {
+  history.replaceState(null, "", `${location.pathname}#${own}`);
 }
 
 async function check() {
@@ -256,17 +280,17 @@ function instructions(state) {
   const rates = state.phase === "testing";
   $("keys-pairs").hidden = rates;
   $("keys-ratings").hidden = !rates;
-  onClick($("practise"), () => practise(state));
+  $("instructions-on").textContent = rates ? "Continue" : "Try two for practice";
+  onClick($("instructions-on"), () => (rates ? ready(state) : practise(state)));
 }
 
 async function practise(state) {
-  const [practice] = await Promise.all([ask("/api/practice"), lookAround()]);
-  for (const [place, pair] of practice.pairs.entries()) {
-    await (state.phase === "testing" ? rated : compared)(
-      { place: place + 1, total: practice.pairs.length, clip: pair.left, ...pair },
-      "Practice",
-    );
-  }
+  const [{ pairs: tried }] = await Promise.all([ask("/api/practice"), lookAround()]);
+  for (const [place, pair] of tried.entries()) await compared({ ...pair, place: place + 1, total: tried.length }, true);
+  ready(state);
+}
+
+function ready(state) {
   turnTo("ready");
   onClick($("read-again"), () => instructions(state));
   onClick($("begin"), async () => go(await send("/api/proceed", { page: "instructions", report: {} })));
@@ -277,7 +301,7 @@ function importance(state) {
   const form = $("importance");
   const request = identity();
   $("importance-items").replaceChildren(...state.importance.map(importanceOf));
-  const groups = [...form.querySelectorAll("fieldset")];
+  const groups = [...form.querySelectorAll(".item")];
   const chosen = (group) => group.querySelector("input:checked");
   const all = () => enable([$("importance-on")], groups.every(chosen));
   all();
@@ -301,22 +325,19 @@ function importance(state) {
 }
 
 function importanceOf(item, place) {
-  const group = document.createElement("fieldset");
-  const text = Object.assign(document.createElement("legend"), { textContent: item.text });
-  const steps = Object.assign(document.createElement("div"), { className: "steps" });
-  MEANINGS.forEach((meaning, step) => {
-    const label = document.createElement("label");
-    const input = Object.assign(document.createElement("input"), { type: "radio", name: `item-${place}`, value: step + 1 });
-    input.setAttribute("aria-label", `${step + 1}, ${meaning}`);
-    label.append(input, String(step + 1));
-    steps.append(label);
+  const make = (kind, properties, ...children) => {
+    const made = Object.assign(document.createElement(kind), properties);
+    made.append(...children);
+    return made;
+  };
+  const text = make("p", { id: `item-${place}`, textContent: item.text });
+  const steps = MEANINGS.map((meaning, step) => {
+    const input = make("input", { type: "radio", name: `item-${place}`, value: step + 1, ariaLabel: `${step + 1}, ${meaning}` });
+    return make("label", {}, input, String(step + 1));
   });
-  const ends = Object.assign(document.createElement("div"), { className: "ends" });
-  ends.setAttribute("aria-hidden", "true");
-  const end = (meaning) => Object.assign(document.createElement("span"), { textContent: meaning });
-  ends.append(end(MEANINGS[0]), end(MEANINGS.at(-1)));
-  group.append(text, steps, ends);
-  return group;
+  const group = make("div", { className: "steps", role: "radiogroup" }, ...steps);
+  group.setAttribute("aria-labelledby", text.id);
+  return make("div", { className: "item" }, text, group);
 }
 
 // --- pairs and ratings ------------------------------------------------------------------------------------------------------
@@ -353,7 +374,7 @@ async function over(reply) {
 const CHOICES = { ArrowLeft: "left", ArrowRight: "right", ArrowDown: "equal", ArrowUp: "unclear" };
 
 /** Shows a pair until somebody has chosen: { choice, report }. */
-function compared(pair, practice = null) {
+function compared(pair, practice = false) {
   const buttons = Object.fromEntries(Object.values(CHOICES).map((choice) => [choice, $(choice)]));
   return chosen({
     page: "pairs",
@@ -370,7 +391,7 @@ function compared(pair, practice = null) {
 }
 
 /** The same of a single scene. */
-function rated(scene, practice = null) {
+function rated(scene) {
   const numbers = [...Array(10).keys()].map((place) => place + 1);
   if (!$("ratings").children.length) {
     $("ratings").append(...numbers.map((number) => Object.assign(document.createElement("button"), { textContent: number })));
@@ -388,7 +409,7 @@ function rated(scene, practice = null) {
     replay: $("scene-replay"),
     place: scene.place,
     total: scene.total,
-    practice,
+    practice: false,
   });
 }
 
@@ -406,6 +427,7 @@ function chosen({ page, what, named, buttons, choiceOf, bar, replay, place, tota
   enable(every, false);
   enable([replay], true);
   announce(both ? "Watch both clips to their end." : "Watch the clip to its end.");
+  $(CANVAS[names[0]]).closest("section").classList.toggle("wide", view.width > WIDE * view.height);
   const stages = names.map((name) => {
     const canvas = $(CANVAS[name]);
     canvas.setAttribute("aria-label", both ? `The ${name} clip` : "The clip");
@@ -463,8 +485,7 @@ async function wait(state) {
 }
 
 function done(state) {
-  const declined = state.code === null && state.progress.done < state.progress.total;
-  turnTo(declined ? "declined" : "done");
+  turnTo(state.outcome === "declined" ? "declined" : "done");
   paragraphs($("thanks-text"), state.texts.thanks);
   $("code-box").hidden = state.code === null;
   $("code").textContent = state.code ?? "";

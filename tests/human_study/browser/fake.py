@@ -12,7 +12,7 @@ from playwright.sync_api import BrowserContext, ConsoleMessage, Page, Route
 
 PAGES = resources.files("peps_jax.human_study") / "pages"
 ORIGIN = "http://study.test"
-POLICY = "default-src 'self'; frame-ancestors *; base-uri 'none'; form-action 'none'"
+POLICY = "default-src 'self'; img-src 'self' blob:; object-src 'none'; base-uri 'none'; form-action 'none'"
 STEPS = 4  # of a clip, 50 ms each
 
 VIEW = {
