@@ -34,7 +34,7 @@ FORMAT = 1
 ENOUGH, HALF = 0.8, 0.5  # shares of a round's queries: to close it after its time; and by hand
 AGREEING = 3  # people who see a shared pair
 DRAWN_FROM = 30  # least-answered pairs from which one is drawn for a participant
-PATIENCE = 2.0  # s until a page that waits asks again
+PATIENCE = 0.5  # s until a page that waits asks again
 CHOICES = ("left", "right", "equal", "unclear")
 LIVE = ("", "running", "over")  # no training that asks; one; one that has ended
 
@@ -708,7 +708,7 @@ class Database:
             f"SELECT {_SAID} FROM said WHERE {where} AND kind IN ('ask', 'shared') AND late = 0 ORDER BY query, participant",
             *([] if round is None else [round]),
         )
-        return [Said(*row) for row in rows if row["participant"] not in set(excluded)]
+        return [_said(row) for row in rows if row["participant"] not in set(excluded)]
 
     def late_answers(self) -> list[Said]:
         """What came when its round was closed."""
@@ -958,6 +958,11 @@ class Database:
 
 _PARTICIPANT = "number, phase, page, consented, outcome, code"
 _SAID = "query, asked, participant, preferred, round, late, kind"
+
+
+def _said(row: sqlite3.Row) -> Said:
+    said = Said(*row)
+    return said._replace(preferred=None if said.preferred is None else float(said.preferred), late=bool(said.late))
 
 
 def digest_of(rows: Sequence[Sequence[Any]]) -> str:

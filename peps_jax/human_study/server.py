@@ -28,6 +28,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from peps_jax.human_study import orders, tokens
 from peps_jax.human_study.database import (
     CHOICES,
+    PATIENCE,
     ConflictError,
     Database,
     Link,
@@ -95,11 +96,11 @@ class Study:
         """Where somebody is in the study: all that a page needs to know to go on."""
         page, outcome, code, progress, seconds = "consent", None, None, (0, 0), None
         if isinstance(who, Participant):
-            who = self.finished(who)
+            who, waits = self._now(self.database.participant(who.number))
             page, outcome, code = who.page, who.outcome, who.code
             progress = self.database.progress(who.number)
-            if page == "pairs" and self.database.has_more(who.number) is None:
-                page, seconds = "wait", Wait(2.0).seconds
+            if waits:
+                page, seconds = "wait", PATIENCE
             if outcome == "declined":
                 page = "done"
         texts = self.settings.texts
@@ -119,13 +120,16 @@ class Study:
             "seconds_to_wait": seconds,
         }
 
-    def finished(self, who: Participant) -> Participant:
-        """The participant, whose end is noted if there is nothing more to show."""
-        if who.page not in ("pairs", "ratings") or self.database.has_more(who.number) is not False:
-            return who
+    def _now(self, who: Participant) -> tuple[Participant, bool]:
+        """The participant, whose end is noted if there is nothing more to show; and whether they wait for something."""
+        if who.page not in ("pairs", "ratings"):
+            return who, False
+        more = self.database.has_more(who.number)
+        if more is not False:
+            return who, more is None
         code = self.settings.codes.get(who.phase) or tokens.code(self.key, who.number)
         self.database.finish(who.number, who.page, code)
-        return self.database.participant(who.number)
+        return self.database.participant(who.number), False
 
     # --- beginning ----------------------------------------------------------------------------------------------------------------
 
@@ -136,7 +140,7 @@ class Study:
         if not agreed:
             if isinstance(who, Participant):
                 self.database.decline(who.number)
-                return self.state(self.database.participant(who.number))
+                return self.state(who)
             return self.state(who) | {"page": "done", "outcome": "declined"}
         self._check_ready(who.phase)
         recruit = self._recruit(platform)
@@ -206,11 +210,11 @@ class Study:
         if pages.index(who.page) < pages.index(page):
             raise ConflictError(f"The page {page} comes later: ask for the state.")
         self.database.turn(who.number, page, self.after(who.phase, page), report)
-        return self.state(self.database.participant(who.number))
+        return self.state(who)
 
     def importance(self, who: Participant, answers: Mapping[str, int], request: str) -> dict[str, Any]:
         self.database.rate_importance(who.number, answers, request, "importance", self.after(who.phase, "importance"))
-        return self.state(self.database.participant(who.number))
+        return self.state(who)
 
     # --- pairs and scenes ------------------------------------------------------------------------------------------------------
 
@@ -218,7 +222,7 @@ class Study:
         """What they see now, as JSON."""
         shown = self.database.next_shown(who.number, self.settings.lease)
         if shown is None:
-            self.finished(who)
+            self._now(who)
             return '{"done": true}'
         if isinstance(shown, Wait):
             return json.dumps({"wait": shown.seconds})
