@@ -19,7 +19,7 @@ import jax
 
 from peps_envs.registry import unknown_name
 from peps_jax.command_line import Command, Parser, Work, called, number, options
-from peps_jax.human_study import making, tokens
+from peps_jax.human_study import making, tokens, work_commands
 from peps_jax.human_study.action import OUT, Action, Errand
 from peps_jax.human_study.database import ConflictError, Database
 from peps_jax.human_study.server import Study
@@ -206,6 +206,7 @@ ACTIONS: dict[str, Action] = {
     "status": Action("who is where, agreement, whether the database is whole", _status_flags, _status),
     "export": Action("CSV and JSON without personal data", _export_flags, _export),
     "erase": Action("removes platforms' ids", lambda parser: None, _erase),
+    **work_commands.ACTIONS,
 }
 
 

@@ -1,8 +1,8 @@
 """Everything that is known of a study, in one SQLite file: all SQL is here.
 
-No acknowledged answer is ever lost: every method that writes returns when what it wrote is on the disk (WAL with
-`synchronous=FULL`), and does all of it or nothing. The file may be opened by several processes at once, a server and a
-training for instance; what they tell one another they tell through it.
+No acknowledged answer is ever lost: a method that writes does all of it or nothing, and returns when it is on the disk (WAL
+with `synchronous=FULL`). What somebody is shown is the exception: that is sure as soon as the next answer is. The file may be
+opened by several processes at once, a server and a training for instance; what they tell one another they tell through it.
 
     study        configuration, and what the pages need of the environments
     link         tokens that many may use, who then get one of their own
@@ -36,7 +36,6 @@ AGREEING = 3  # people who see a shared pair
 DRAWN_FROM = 30  # least-answered pairs from which one is drawn for a participant
 PATIENCE = 0.5  # s until a page that waits asks again
 CHOICES = ("left", "right", "equal", "unclear")
-LIVE = ("", "running", "over")  # no training that asks; one; one that has ended
 
 SCHEMA = """
 CREATE TABLE study (name TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
@@ -282,9 +281,14 @@ class Database:
             self._connection.close()
 
     @contextlib.contextmanager
-    def _writing(self) -> Iterator[sqlite3.Connection]:
-        """All or nothing; on the disk at the end."""
+    def _writing(self, synced: bool = True) -> Iterator[sqlite3.Connection]:
+        """All or nothing; on the disk at the end.
+
+        Args:
+          synced: False of what may be lost if the power fails before the next answer, though not if the process is killed.
+        """
         with self._lock:
+            self._connection.execute(f"PRAGMA synchronous = {'FULL' if synced else 'NORMAL'}")
             self._connection.execute("BEGIN IMMEDIATE")
             try:
                 yield self._connection
@@ -551,7 +555,7 @@ class Database:
 
         Nobody else gets their pair for `lease` seconds. A pair is drawn among the least-answered ones that they haven't seen.
         """
-        with self._writing() as connection:
+        with self._writing(synced=False) as connection:
             while True:
                 row = connection.execute(
                     "SELECT * FROM assignment WHERE participant = ? AND answered = 0 ORDER BY place LIMIT 1",
@@ -561,7 +565,7 @@ class Database:
                     return None
                 if row["query"] is None and row["scene"] is None:
                     number = self._query_for(connection, row)
-                    if number is None and self._awaits(connection):
+                    if number is None and self._awaits():
                         return Wait(PATIENCE)
                     if number is None:
                         _drop(connection, row)
@@ -585,7 +589,7 @@ class Database:
                 return True
             if self._query_for(connection, rows[0]) is not None:
                 return True
-            if self._awaits(connection):
+            if self._awaits():
                 return None
             return any(row["kind"] == "check" or self._query_for(connection, row) is not None for row in rows)
 
@@ -601,10 +605,9 @@ class Database:
         sides = (row["second"], row["first"]) if row["swapped"] else (row["first"], row["second"])
         return Next(row["place"], sides)
 
-    @staticmethod
-    def _awaits(connection: sqlite3.Connection) -> bool:
-        row = connection.execute("SELECT value FROM study WHERE name = 'live'").fetchone()
-        return row is not None and json.loads(row[0]) == "running"
+    def _awaits(self) -> bool:
+        """Whether there may be more to ask later."""
+        return self.live == "running"
 
     def _query_for(self, connection: sqlite3.Connection, assignment: sqlite3.Row) -> int | None:
         """The query that somebody is shown at an assignment that has none yet; None if there is none."""
@@ -634,7 +637,7 @@ class Database:
             alike = [row["number"] for row in found if row["answered"] == found[0]["answered"]]
             return chance.choice(alike) if alike else None
 
-        if self._awaits(connection):
+        if self.live:
             return draw(f"round IN (SELECT number FROM round WHERE closed IS NULL) AND answered < people AND {free}")
         single = f"round IS NULL AND people = 1 AND {free}"
         begun = f"round IS NULL AND people > 1 AND answered < people AND {free}"
@@ -729,16 +732,16 @@ class Database:
     # --- a training that waits for people --------------------------------------------------------------------------------------
 
     def begin_live(self) -> None:
-        """A training asks from now on: participants without a pair wait for the next round."""
+        """A training asks from now on, and it alone: participants without a pair wait for the next round."""
         self.note("live", "running")
 
     def end_live(self) -> None:
-        """The training is over: who waits is done."""
+        """The training is over: nothing more is asked."""
         self.note("live", "over")
 
     @property
     def live(self) -> str:
-        """One of `LIVE`."""
+        """Whether a training asks: "running", "over", or "" of a study in which none has."""
         return self.noted("live") or ""
 
     def open_round(self, round: int, numbers: Sequence[int], stimuli: Sequence[Stimulus], people: int = 1) -> Round:

@@ -18,7 +18,6 @@ from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import anyio
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
@@ -360,6 +359,9 @@ _ANSWER = {"place": _whole(0, MOST), "choice": _one_of(*CHOICES), "frames": _sid
 _RATING = {"place": _whole(0, MOST), "rating": _whole(1, 10), "frames": _frames, "request": _request_id} | _WATCHED
 
 
+_ANSWERED, _RATED = ("place", "choice", "frames", "request"), ("place", "rating", "frames", "request")
+
+
 def _watching(read: Mapping[str, Any]) -> Watching:
     return Watching(*(read[name] for name in Watching._fields))
 
@@ -377,7 +379,9 @@ async def _body(request: Request) -> Any:
         if len(content) > LARGEST:
             raise RefusedError(413, f"the body is larger than {LARGEST} bytes")
     try:
-        return json.loads(content, parse_constant=_no_number)
+        value = json.loads(content, parse_constant=_no_number)
+        json.dumps(value, ensure_ascii=False).encode()  # halves of characters are no text
+        return value
     except (ValueError, RecursionError):
         raise RefusedError(400, "the body is no JSON") from None
 
@@ -392,11 +396,11 @@ Handler = Callable[[Request], Awaitable[Response]]
 
 
 def application(study: Study) -> ASGIApp:
-    """The pages and what they ask for. All that needs the database waits in one line, in a thread of its own."""
-    line = anyio.CapacityLimiter(1)
+    """The pages and what they ask for.
 
-    async def do(function: Callable[..., Any], *values: Any) -> Any:
-        return await anyio.to_thread.run_sync(lambda: function(*values), limiter=line)
+    Handlers ask the database in the event loop's own thread: that takes a millisecond, and a few more until the disk is sure of
+    an answer, and only one can write at a time anyway. Handing it to other threads took longer on a busy machine.
+    """
 
     async def holder(request: Request) -> Participant | Link | None:
         """Who asks: a participant, somebody with a link's token, or None, the researcher."""
@@ -406,7 +410,7 @@ def application(study: Study) -> ASGIApp:
         if study.guesses.refuses(address, digest):
             raise RefusedError(429, "too many wrong tokens: wait a minute")
         if scheme.lower() == "bearer" and token:
-            who = None if digest == study.researcher else await do(study.database.holder, digest)
+            who = None if digest == study.researcher else study.database.holder(digest)
             if who is not None or digest == study.researcher:
                 study.guesses.right(digest)
                 if isinstance(who, Participant):
@@ -437,33 +441,33 @@ def application(study: Study) -> ASGIApp:
             raise RefusedError(403, "this needs the researcher's link")
 
     async def state(request: Request) -> Response:
-        return JSONResponse(await do(study.state, await anybody(request)))
+        return JSONResponse(study.state(await anybody(request)))
 
     async def consent(request: Request) -> Response:
         who = await anybody(request)
         read = _record(await _body(request), {"agreed": _boolean, "platform": _platform})
-        return JSONResponse(await do(study.consent, who, read["agreed"], read["platform"]))
+        return JSONResponse(study.consent(who, read["agreed"], read["platform"]))
 
     async def proceed(request: Request) -> Response:
         who = await participant(request, "check")
         fields = {"page": _one_of("check", "instructions"), "report": _report}
         read = _record({"report": {}} | _object(await _body(request)), fields)
-        return JSONResponse(await do(study.proceed, who, read["page"], read["report"] or None))
+        return JSONResponse(study.proceed(who, read["page"], read["report"] or None))
 
     async def importance(request: Request) -> Response:
         who = await participant(request, "importance")
         names = [one.name for one in study.settings.importance]
         scale = lambda value: _record(value, dict.fromkeys(names, _whole(1, 5)), "answers")
         read = _record(await _body(request), {"answers": scale, "request": _request_id})
-        return JSONResponse(await do(study.importance, who, read["answers"], read["request"]))
+        return JSONResponse(study.importance(who, read["answers"], read["request"]))
 
     async def practice(request: Request) -> Response:
         await participant(request, "pairs")
-        return _json(await do(study.practice))
+        return _json(study.practice())
 
     async def view(request: Request) -> Response:
         who = await anybody(request)
-        return _json(await do(study.view, who.phase))
+        return _json(study.view(who.phase))
 
     def shows(page: str) -> Handler:
         async def show(request: Request) -> Response:
@@ -472,36 +476,30 @@ def application(study: Study) -> ASGIApp:
                 return _json('{"done": true}')
             if who.page != page:
                 raise RefusedError(409, f"first comes the page {who.page}")
-            return _json(await do(study.show, who))
+            return _json(study.show(who))
 
         return show
 
     async def answer(request: Request) -> Response:
         who = await participant(request, "pairs")
         read = _record(await _body(request), _ANSWER)
-        await do(
-            study.database.answer, who.number, read["place"], read["choice"], read["frames"], _watching(read),
-            read["request"],
-        )  # fmt: skip
-        return JSONResponse({"ok": True, "state": await do(study.state, who)})
+        study.database.answer(who.number, watching=_watching(read), **{name: read[name] for name in _ANSWERED})
+        return JSONResponse({"ok": True, "state": study.state(who)})
 
     async def rating(request: Request) -> Response:
         who = await participant(request, "ratings")
         read = _record(await _body(request), _RATING)
-        await do(
-            study.database.rate, who.number, read["place"], read["rating"], read["frames"], _watching(read),
-            read["request"],
-        )  # fmt: skip
-        return JSONResponse({"ok": True, "state": await do(study.state, who)})
+        study.database.rate(who.number, watching=_watching(read), **{name: read[name] for name in _RATED})
+        return JSONResponse({"ok": True, "state": study.state(who)})
 
     async def overview(request: Request) -> Response:
         await researcher(request)
-        return JSONResponse(await do(study.overview))
+        return JSONResponse(study.overview())
 
     async def picture(request: Request) -> Response:
         await researcher(request)
         try:
-            content = await do(study.folder.picture.read_bytes)
+            content = study.folder.picture.read_bytes()
         except FileNotFoundError:
             raise RefusedError(404, "there is no picture yet") from None
         return Response(content, media_type="image/png")
@@ -510,7 +508,7 @@ def application(study: Study) -> ASGIApp:
         await researcher(request)
         read = _record(await _body(request), {"round": _whole(0, MOST)})
         try:
-            why = await do(study.database.close_round, read["round"])
+            why = study.database.close_round(read["round"])
         except ValueError as error:
             raise RefusedError(409, str(error)) from None
         return JSONResponse({"ok": True, "why": why})
