@@ -8,6 +8,8 @@ training without anybody to ask.
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import json
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -25,12 +27,14 @@ from peps_jax.execution.program import shared
 from peps_jax.human_study import pairs, pictures
 from peps_jax.human_study.database import Database, Round, Said
 from peps_jax.human_study.settings import Folder
+from peps_jax.learning import surrogate
 from peps_jax.preferences import data, teachers
 from peps_jax.preferences.data import NOBODY, Answers, PreferenceSet, Queries, Segments
 from peps_jax.reproduce.driving import experiment
 from peps_jax.reproduce.driving.scenes import road
 from peps_jax.round import round_at
 from peps_jax.storage import files
+from peps_jax.storage.arrays import write_arrays
 from peps_jax.train import Result, check, collect_and_ask, finish, hear, init, learn_and_improve, prepare
 from peps_jax.train import train as trained
 
@@ -109,6 +113,7 @@ class Agents(NamedTuple):
 
     scenes: Segments  # (seeds, scenes, horizon, ...)
     learned: Any  # policies and what else was learned, (seeds, ...)
+    logits: np.ndarray  # (seeds, answered pairs) of the first being preferred, by r-hat; 0 of a method that learns none
 
     @property
     def digest(self) -> str:
@@ -127,13 +132,121 @@ def learn(configs: Sequence[Config], recorded: PreferenceSet, scenes: int) -> Ag
     def one(config: Config) -> Agents:
         result = trained(config, teachers.recorded(recorded))
         key = jax.random.fold_in(generator.key(config.seed), 2)
-        return Agents(pictures.watch(result, key, scenes), (result.agents, result.knowledge))
+        logits = jnp.zeros(recorded.number.shape[0], jnp.float32)
+        if result.surrogate is not None:
+            settings = result.training.settings.surrogate
+            logits = jnp.mean(surrogate.preference_logits(result.surrogate, recorded, settings), 0)
+        return Agents(pictures.watch(result, key, scenes), (result.agents, result.knowledge), logits)
 
     for config in configs:
         check(config)
         teachers.recorded(recorded).check(True, prepare(config).settings)
     program, runs = compile_over_devices(one, list(map(shared, configs)))
     return jax.tree.map(lambda rows: np.asarray(rows)[: len(configs)], program(runs))
+
+
+@dataclasses.dataclass(frozen=True)
+class Lesson:
+    """Agents of one method that learn from a study's answers and act in its testing environment; noted in the study."""
+
+    method: str
+    seeds: tuple[int, ...]
+    scenes: int  # in which each agent is watched
+    changes: Mapping[str, Any]  # settings of the training
+
+    def configs(self, test_env: str) -> list[Config]:
+        """A training for each seed. Raises ValueError for settings that make no sense."""
+        made = [
+            config_of(test_env, **(dict(self.changes) | {"method": self.method, "seed": seed})) for seed in self.seeds
+        ]
+        for config in made:
+            check(config)
+        return made
+
+    def said(self) -> dict[str, Any]:
+        return json.loads(json.dumps(dataclasses.asdict(self)))
+
+    @classmethod
+    def read(cls, said: Mapping[str, Any]) -> Lesson:
+        """What `said` told."""
+        changes = {name: tuple(value) if isinstance(value, list) else value for name, value in said["changes"].items()}
+        return cls(said["method"], tuple(said["seeds"]), said["scenes"], changes)
+
+
+def teach(
+    folder: Folder, lessons: Sequence[Lesson], excluded: Iterable[int], say: Callable[[str], None] = print
+) -> None:
+    """Trains agents from the answers that a study holds, and puts what they do there, for others to rate.
+
+    Raises:
+      ValueError: there are no answers, or such agents were trained from others; one line says which.
+    """
+    settings, database = folder.settings(), Database(folder.database)
+    excluded = sorted(excluded)
+    with contextlib.closing(database):
+        problem, test = pairs.problem(settings.env), pairs.problem(settings.test_env)
+        recorded = preferences(database, problem, excluded)
+        told = _told(database, excluded)
+        say(f"{len(told)} answers to {recorded.number.shape[0]} pairs, without those of {len(excluded)} participants")
+        for lesson in lessons:
+            configs, before = lesson.configs(settings.test_env), database.noted(f"agents {lesson.method}")
+            agents = learn(configs, recorded, lesson.scenes)
+            if before is not None and before["digest"] != agents.digest:
+                raise ValueError(
+                    f"method {lesson.method!r} has agents already, which learned something else: make a new study, for raters may "
+                    "have seen them"
+                )
+            flat = jax.tree.map(lambda rows: rows.reshape(-1, *rows.shape[2:]), agents.scenes)
+            new = database.add_scenes(lesson.method, pairs.scenes_of(test, flat))
+            noted = {"lesson": lesson.said(), "excluded": excluded, "answers": told, "digest": agents.digest}
+            database.note(f"agents {lesson.method}", noted)
+            if np.any(agents.logits):
+                kept = {"queries": _answered(database, excluded), "logits": agents.logits.mean(0)}
+                write_arrays(folder.path / f"surrogate-{lesson.method}.npz", database.path.name, kept)
+            say(f"{lesson.method}: {len(configs)} agents learned, {new} new scenes of them are there to be rated")
+
+
+def _told(database: Database, excluded: Sequence[int]) -> list[list[Any]]:
+    """Every answer that counts: query, participant, P(first preferred)."""
+    return [[one.query, one.participant, one.preferred] for one in database.answers(excluded=excluded)]
+
+
+def _answered(database: Database, excluded: Sequence[int]) -> np.ndarray:
+    """Numbers of the queries that somebody has answered, in their order, as in `preferences`."""
+    return np.array(sorted({query for query, _, preferred in _told(database, excluded) if preferred is not None}))
+
+
+def replay_lessons(folder: Folder) -> list[str]:
+    """Trains again what was trained from the study's answers; a line for each method.
+
+    Raises:
+      DiffersError: an answer is missing, new or another one, or something else is learned.
+    """
+    settings, lines = folder.settings(), []
+    with contextlib.closing(Database(folder.database)) as database:
+        for method in methods.METHODS:
+            noted = database.noted(f"agents {method}")
+            if noted is None:
+                continue
+            _check_told(noted["answers"], _told(database, noted["excluded"]))
+            lesson = Lesson.read(noted["lesson"])
+            recorded = preferences(database, pairs.problem(settings.env), noted["excluded"])
+            if learn(lesson.configs(settings.test_env), recorded, lesson.scenes).digest != noted["digest"]:
+                raise DiffersError(f"{method}: the answers are what they were, but what is learned differs")
+            lines.append(f"{method}: {len(noted['answers'])} answers and {len(lesson.seeds)} agents are what they were")
+    return lines
+
+
+def _check_told(before: Sequence[Sequence[Any]], now: Sequence[Sequence[Any]]) -> None:
+    """Raises DiffersError for the first answer that isn't what it was."""
+    then, there = ({(row[0], row[1]): row[2] for row in rows} for rows in (before, now))
+    for query, participant in sorted(then.keys() | there.keys()):
+        key = query, participant
+        if then.get(key, "none") != there.get(key, "none"):
+            what = "is missing" if key not in there else "is new" if key not in then else "has changed"
+            raise DiffersError(
+                f"participant {participant}'s answer to query {query} {what} since the agents were trained"
+            )
 
 
 # --- with people in the loop ----------------------------------------------------------------------------------------------
@@ -250,11 +363,15 @@ class Live:
         self._undrawn: tuple[Result, int] | None = None
         self._told: str | None = None
 
+    def begin(self) -> None:
+        """From now on whoever has no pair waits for one."""
+        self._database.begin_live()
+
     def run(self) -> Result:
         """All rounds; returns when the last one is answered. What was learned is kept and shown then."""
         database, problem = self._database, self.config.problem()
+        self.begin()
         warm_up(self.config)
-        database.begin_live()
         result = run(self.config, people(database, problem, self._round_time, self._wait), self._learned)
         self._draw()
         data.save(self._folder.path / "answers.npz", result.preferences)
@@ -287,10 +404,11 @@ class Live:
 
     def _wait(self, database: Database, round: Round) -> None:
         """Shows what was learned last, while people watch what is asked now; then waits."""
-        waits_for = database.waits_for(round.number)
-        if waits_for != self._told:
-            self._say(f"round {round.number + 1} of {self.config.num_rounds}: {waits_for}")
-            self._told = waits_for
+        overdue = time.time() - round.opened > self._round_time
+        told = database.waits_for(round.number) if overdue else f"{round.asked} pairs are asked"
+        if told != self._told:
+            self._say(f"round {round.number + 1} of {self.config.num_rounds}: {told}")
+            self._told = told
         self._draw()
         time.sleep(LOOK)
 
