@@ -31,6 +31,7 @@ from peps_jax.storage.tables import csv_bytes
 PROG = called("peps_jax.human_study", "peps-study")
 MOST = 1000  # invitations at once
 EXPORT = "export"
+DESCRIPTION = "A study with people, and training that waits for their answers."
 
 
 def _make_flags(parser: argparse.ArgumentParser) -> None:
@@ -39,7 +40,7 @@ def _make_flags(parser: argparse.ArgumentParser) -> None:
         "--test-env", default=None, metavar="NAME", help="of the testing phase [highway-rain, or --env]"
     )
     for field in NUMBERS:
-        text = f"{field.metadata['text']} [{field.default}]"
+        text = f"{field.metadata['text']} [{field.default}]".replace("%", "%%")
         flag = f"--{field.name.replace('_', '-')}"
         parser.add_argument(flag, default=None, dest=field.name, help=text, **options(field.default))
 
@@ -104,7 +105,12 @@ def _serve_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def _serve(values: argparse.Namespace) -> Work:
-    serving = Serving(Study(Folder(Path(values.out))), values.host, values.port, values.behind_proxy)
+    study = Study(Folder(Path(values.out)))
+    try:
+        serving = Serving(study, values.host, values.port, values.behind_proxy)
+    except ValueError:
+        study.database.close()
+        raise
 
     def serve() -> int:
         print(f"researcher: {serving.researcher_link}", flush=True)
@@ -210,16 +216,20 @@ ACTIONS: dict[str, Action] = {
 }
 
 
-def parser() -> Parser:
-    """The command line's parser."""
-    made = Parser(PROG, "COMMAND ", description="A study with people, and training that waits for their answers.")
-    commands = made.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
-    for name, action in ACTIONS.items():
-        own = commands.add_parser(f"{name}", help=action.about, description=action.about)
-        own.prog = f"{PROG} {name}"
-        own.add_argument("--out", default=OUT, metavar="DIR", help=f"the study's folder [{OUT}]")
-        action.flags(own)
+def parser(name: str) -> Parser:
+    """The parser of one command's flags."""
+    action = ACTIONS[name]
+    before = "N " if name == "invite" else ""
+    made = Parser(f"{PROG} {name}", before, description=action.about[0].upper() + action.about[1:] + ".")
+    made.add_argument("--out", default=OUT, metavar="DIR", help=f"the study's folder [{OUT}]")
+    action.flags(made)
     return made
+
+
+def overview() -> Parser:
+    """What shows all commands."""
+    texts = "\n".join(f"  {name:10} {action.about}" for name, action in ACTIONS.items())
+    return Parser(PROG, "COMMAND ", description=DESCRIPTION, epilog=f"commands, each with --help:\n{texts}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -228,7 +238,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _read(arguments: Sequence[str]) -> argparse.Namespace:
-    values = parser().parse(arguments)
-    if not ACTIONS[values.command].computes:
+    name, *flags = given = arguments or ["--help"]
+    if name not in ACTIONS:
+        overview().parse(given if name.startswith("-") else [])
+        overview().error(unknown_name("command", name, ACTIONS))
+    if not ACTIONS[name].computes:
         jax.config.update("jax_platforms", "cpu")  # a training beside it may need the others
+    values = parser(name).parse(flags)
+    values.command = name
     return values

@@ -55,7 +55,7 @@ def to_ask(env: str, seed: int, number: int) -> Segments:
     """`number` pairs for the training phase: numpy arrays, (number, 2, steps, ...)."""
     key_drive, key_cut = jax.random.split(jax.random.fold_in(generator.key(seed), 1))
     if is_road(env):
-        made = _cut_drives(comparisons.drive(key_drive, SPARE * number), key_cut)
+        made = _cut_drives(_drive(key_drive, SPARE * number), key_cut)
         unfit = jnp.any(crashed(made), -1) | (_shortest(made) < comparisons.SHORTEST)
     else:
         made = _cut_routes(*routes(key_drive, problem(env), SPARE * number), key_cut)
@@ -64,6 +64,7 @@ def to_ask(env: str, seed: int, number: int) -> Segments:
     return jax.tree.map(lambda rows: np.asarray(rows)[chosen], made)
 
 
+_drive = jax.jit(comparisons.drive, static_argnums=1)
 _cut_drives = jax.jit(lambda scenes, key: comparisons.cut(key, scenes))
 
 
@@ -81,7 +82,8 @@ def to_check(env: str, seed: int, number: int) -> Segments | None:
         return None
     key = jax.random.fold_in(generator.key(seed), 2)
     keep = lambda action: lambda observation, key, time: jnp.full(number, action)
-    sides = [watch(keep(action), road(DRY).problem(), key, number) for action in (SLOWER, IDLE)]
+    shown = jax.jit(lambda action, task: watch(keep(action), task, key, number))
+    sides = [shown(action, road(DRY).problem()) for action in (SLOWER, IDLE)]
     pairs = jax.tree.map(lambda *rows: np.stack(rows, 1), *sides)
     first, second = np.asarray(crashed(pairs)).T
     if np.any(first) or not np.all(second):

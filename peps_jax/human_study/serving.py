@@ -37,6 +37,7 @@ class Serving:
         self._socket = _listen(host, port)
         config = uvicorn.Config(
             application(study),
+            log_config=None,
             access_log=False,  # participants' addresses are nobody's business
             log_level="warning",
             lifespan="off",
@@ -84,6 +85,7 @@ class Serving:
 
 
 def _listen(host: str, port: int) -> socket.socket:
+    made = None
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         made = socket.socket(family, socket.SOCK_STREAM)
@@ -91,7 +93,8 @@ def _listen(host: str, port: int) -> socket.socket:
         made.bind((host, port))
         made.listen(BACKLOG)
     except (OSError, OverflowError) as error:
-        raise ValueError(
-            f"port {port} of {host!r} can't be used: {getattr(error, 'strerror', None) or error}; choose another --port"
-        ) from None
+        if made is not None:
+            made.close()
+        why = getattr(error, "strerror", None) or error
+        raise ValueError(f"port {port} of {host!r} can't be used: {why}; choose another --port") from None
     return made
