@@ -78,7 +78,7 @@ function tiles(now) {
   $("left").textContent = share(now.left_share);
   $("checks").textContent = failed.reduce((sum, number) => sum + number, 0);
   $("checks").dataset.warn = failed.some(Boolean);
-  $("checks-more").textContent = failed.some(Boolean) ? `by ${failed.filter(Boolean).length} people` : "";
+  $("checks-more").textContent = failed.some(Boolean) ? `by ${counted(failed.filter(Boolean).length)}` : "";
   rates.push(now.answers_per_minute);
   if (rates.length > KEPT) rates.shift();
   curve($("rates"));
@@ -100,6 +100,8 @@ function curve(canvas) {
   context.lineJoin = "round";
   context.stroke();
 }
+
+const counted = (people) => (people === 1 ? "1 person" : `${people} people`);
 
 const isHere = (one) => one.page !== "done" && one.last_seen_s !== null && one.last_seen_s < HERE;
 

@@ -6,7 +6,8 @@ import { Player } from "./player.js";
 const $ = (id) => document.getElementById(id);
 const WIDE = 3; // times its height, a scene that lies in a strip
 const FLASH = 180; // ms for which one sees what one has chosen
-const POLL = 3; // s, the longest time between two questions of one who waits
+const WAITS = [300, 700, 1500, 3000]; // ms between questions of one who waits; the last one from then on
+const LONG = 5; // s of waiting from which on it is said how long
 const ENOUGH = { frames: 25, width: 600, height: 480 }; // frames a second, pixels
 const MEASURED = 1500; // ms for which frames are counted
 const PLATFORMS = ["PROLIFIC_PID", "STUDY_ID", "SESSION_ID", "workerId", "assignmentId", "hitId", "turkSubmitTo"];
@@ -16,6 +17,8 @@ const MEANINGS = ["not important", "slightly important", "important", "very impo
 let view = null; // what all clips share
 let player = null; // of what is on the screen
 let press = () => false; // what a key does here, true if anything
+let notice = ""; // what is said beside the next thing that is shown
+let waits = 0; // how often somebody who waits has asked
 let visit = 0; // counts what was shown: what was begun before is over
 
 // --- what is sent -----------------------------------------------------------------------------------------------------------
@@ -75,7 +78,7 @@ async function guarded(action) {
     if (!(error instanceof Refused)) throw error;
     if (error.status === 409) {
       // said in another tab, or before a reload: go on from where the server is
-      announce("This one was answered in another window.");
+      notice = "That one was answered already. ";
       await guarded(async () => go(await ask("/api/state")));
     } else if (error.status === 429) {
       refuse("Too many attempts with links that don’t work. Please try again in a few minutes.", error.message);
@@ -105,7 +108,7 @@ function go(state) {
 
 /** Shows one page and hides the others; returns whether a later step still belongs to it. */
 function turnTo(page) {
-  const here = ++visit;
+  visit += 1;
   player?.stop();
   player = null;
   press = () => false;
@@ -119,6 +122,12 @@ function turnTo(page) {
     scrollTo(0, 0);
     section.querySelector("h1")?.focus({ preventScroll: true });
   }
+  return still();
+}
+
+/** Leaves what is shown; returns whether a later step still belongs to it. */
+function still() {
+  const here = visit;
   return () => here === visit;
 }
 
@@ -132,10 +141,6 @@ function progress(done, total, text) {
   $("progress-bar").max = Math.max(total, 1);
   $("progress-bar").value = done;
   $("progress-text").textContent = text;
-}
-
-function announce(text) {
-  for (const id of ["pair-hint", "scene-hint"]) $(id).textContent = text;
 }
 
 function enable(buttons, can) {
@@ -286,7 +291,7 @@ function instructions(state) {
 
 async function practise(state) {
   const [{ pairs: tried }] = await Promise.all([ask("/api/practice"), lookAround()]);
-  for (const [place, pair] of tried.entries()) await compared({ ...pair, place: place + 1, total: tried.length }, true);
+  for (const [place, pair] of tried.entries()) await compared({ ...pair, place, total: tried.length }, true);
   ready(state);
 }
 
@@ -417,17 +422,22 @@ const CANVAS = { left: "left-clip", right: "right-clip", clip: "scene-clip" };
 
 function chosen({ page, what, named, buttons, choiceOf, bar, replay, place, total, practice }) {
   const there = turnTo(page);
+  waits = 0;
   const request = identity();
   const names = Object.keys(named);
   const every = Object.values(buttons);
+  const section = document.querySelector(`section[data-page="${page}"]`);
   const both = names.length > 1;
-  progress(place - 1, total, `${practice ? "Practice" : what} ${place} of ${total}`);
+  progress(place, total, `${practice ? "Practice" : what} ${place + 1} of ${total}`);
   $("practice-mark").hidden = !practice;
   for (const button of every) button.classList.remove("chosen");
   enable(every, false);
   enable([replay], true);
-  announce(both ? "Watch both clips to their end." : "Watch the clip to its end.");
-  $(CANVAS[names[0]]).closest("section").classList.toggle("wide", view.width > WIDE * view.height);
+  const hint = section.querySelector(".hint");
+  const announce = (text) => (hint.textContent = text);
+  announce(`${notice}Watch ${both ? "both clips to their end" : "the clip to its end"}.`);
+  notice = "";
+  section.classList.toggle("wide", view.width > WIDE * view.height);
   const stages = names.map((name) => {
     const canvas = $(CANVAS[name]);
     canvas.setAttribute("aria-label", both ? `The ${name} clip` : "The clip");
@@ -446,7 +456,7 @@ function chosen({ page, what, named, buttons, choiceOf, bar, replay, place, tota
     const choose = async (choice) => {
       if (said || !there()) return;
       if (!mine.seen) {
-        announce(both ? "First watch both clips to their end." : "First watch the clip to its end.");
+        announce(`First watch ${both ? "both clips to their end" : "the clip to its end"}.`);
         return;
       }
       said = true;
@@ -476,11 +486,12 @@ function chosen({ page, what, named, buttons, choiceOf, bar, replay, place, tota
 
 // --- wait, done -------------------------------------------------------------------------------------------------------------
 
-async function wait(state) {
-  const there = turnTo("wait");
-  const seconds = state.seconds_to_wait ?? POLL;
-  $("wait-time").textContent = state.seconds_to_wait > POLL ? `About ${Math.ceil(seconds)} seconds.` : "";
-  await pause(1000 * Math.min(Math.max(seconds, 0.2), POLL));
+/** Asks again, soon at first and then less often; who has to wait but a moment sees no other page. */
+async function wait({ seconds_to_wait: seconds }) {
+  const there = waits ? turnTo("wait") : still();
+  $("wait-time").textContent = seconds > LONG ? `About ${Math.ceil(seconds)} seconds.` : "";
+  await pause(WAITS[Math.min(waits, WAITS.length - 1)]);
+  waits += 1;
   if (there()) go(await ask("/api/state"));
 }
 

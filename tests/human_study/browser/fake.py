@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import mimetypes
+from collections.abc import Callable
 from importlib import resources
 from typing import Any
 from urllib.parse import urlsplit
@@ -62,7 +63,7 @@ class Fake:
         self.pairs = 3
         self.steps = STEPS
         self.requests: list[tuple[str, str, Any]] = []
-        self.answers: dict[int, dict[str, Any]] = {}  # by place
+        self.answers: dict[int, dict[str, Any]] = {}  # by place, from 0 on
         self.lost = 0  # so many posts reach nobody
         self.unheard = 0  # so many posts arrive, and what is answered is lost
         self.refusal: tuple[int, str] | None = None
@@ -120,7 +121,7 @@ class Fake:
                 self.state["page"] = "check" if body["agreed"] else "done"
                 return 200, self.state
             case "proceed":
-                order = ["check", "instructions", "importance"]
+                order = ["check", "instructions", "ratings" if self.state["phase"] == "testing" else "importance"]
                 self.state["page"] = order[order.index(body["page"]) + 1]
                 return 200, self.state
             case "importance":
@@ -131,8 +132,8 @@ class Fake:
             case "view":
                 return 200, VIEW
             case "pair" | "scene" as what:
-                place = len(self.answers) + 1
-                if place > self.pairs:
+                place = len(self.answers)
+                if place == self.pairs:
                     return 200, {"done": True}
                 sides = {"left": clip(0, self.steps), "right": clip(400, self.steps)}
                 shown = sides if what == "pair" else {"clip": clip(0, self.steps)}
@@ -166,3 +167,13 @@ def hide(page: Page, hidden: bool) -> None:
         }""",
         hidden,
     )
+
+
+def clicking(page: Page, by: str) -> Callable[[str], None]:
+    """How buttons are used: with "keys" alone, or with the mouse."""
+
+    def enter(button: str) -> None:
+        page.wait_for_selector(f"{button}:visible")  # a press alone doesn't wait
+        page.press(button, "Enter")
+
+    return enter if by == "keys" else page.click

@@ -66,3 +66,37 @@ def test_a_clip_shows_the_films_scenes(page, fake, name):
             assert min(np.abs(other - numbers(shape)).max() for other in alike) < error
         over = [[look(shape) for shape in shapes if shape["kind"] != "polyline"] for shapes in (found, wanted)]
         assert over[0] == over[1], "they lie over one another in the same order"
+
+
+DRAW = """async ([view, scene, width, height, places]) => {
+    const { draw, fit } = await import("/static/drawing.js");
+    const canvas = document.createElement("canvas");
+    const room = fit(canvas, view, width, height);
+    draw(canvas, scene, room, view.colours);
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    const at = ([x, y]) => [...data.slice(4 * (y * canvas.width + x)).slice(0, 3)];
+    return { size: [canvas.width, canvas.height], pixels: places.map(at) };
+}"""
+RED, BLUE, GREY = [255, 0, 0], [0, 0, 255], [128, 128, 128]
+
+
+@pytest.mark.parametrize(
+    ("box", "y_down", "size", "red", "blue"),
+    [
+        ((200, 60), True, (200, 50), (50, 10), (150, 40)),
+        ((200, 60), False, (200, 50), (50, 40), (150, 10)),
+        ((60, 200), True, (50, 200), (10, 150), (40, 50)),  # upright: x goes up, its right stays right
+        ((60, 200), False, (50, 200), (40, 150), (10, 50)),
+    ],
+)
+def test_a_scene_is_drawn_where_it_is(page, fake, box, y_down, size, red, blue):
+    """A red square a quarter of the way along, a blue one at three quarters on the other side of a wide scene."""
+    squares = [("red", 25.0, 5.0), ("#0000ff", 75.0, 20.0)]
+    look = {"kind": "rectangle", "width": 6.0, "height": 6.0, "angle": 0.5, "outline": None}
+    shapes = [look | {"colour": colour, "x": x, "y": y} for colour, x, y in squares]
+    scene = {"extent": [0, 100, 0, 25], "y_down": y_down, "background": "road", "shapes": shapes}
+    view = {"width": 100, "height": 25, "colours": {"road": "#808080"}}
+    fake.open(page)
+    drawn = page.evaluate(DRAW, [view, scene, *box, [red, blue, (size[0] // 2, size[1] // 2)]])
+    assert tuple(drawn["size"]) == size
+    assert drawn["pixels"] == [RED, BLUE, GREY]

@@ -6,7 +6,7 @@ import re
 import pytest
 from playwright.sync_api import expect
 
-from browser.fake import ORIGIN, STEPS, Fake, hide
+from browser.fake import ORIGIN, STEPS, Fake, clicking, hide
 
 KEYS = {"left": "ArrowLeft", "right": "ArrowRight", "equal": "ArrowDown", "unclear": "ArrowUp"}
 LOST = re.compile(
@@ -26,9 +26,9 @@ def seen(page):
     )
 
 
-def answered(page, place):
-    """Waits until something after the pair at `place` is shown."""
-    page.wait_for_selector(f"#progress-text:visible:has-text('{place + 1} of'), [data-page=done]:not([hidden])")
+def answered(page, number):
+    """Waits until so many are answered."""
+    page.wait_for_selector(f"#progress-text:visible:has-text('{number + 1} of'), [data-page=done]:not([hidden])")
 
 
 def by_key(page, choice):
@@ -39,30 +39,28 @@ def by_button(page, choice):
     page.click(f"#{choice}")
 
 
-@pytest.mark.parametrize("answer", [by_key, by_button])
-def test_the_training_phase_from_start_to_end(page, fake, answer):
+@pytest.mark.parametrize("by", ["keys", "buttons"])
+def test_the_training_phase_from_start_to_end(page, fake, by):
     fake.state["page"] = "consent"
     fake.open(page)
-    click = (
-        (lambda name: page.press(f"#{name}", "Enter")) if answer is by_key else (lambda name: page.click(f"#{name}"))
-    )
-    click("agree")
+    click, answer = clicking(page, by), by_key if by == "keys" else by_button
+    click("#agree")
     page.wait_for_selector("#check-on[aria-disabled=false]")
-    click("check-on")
-    click("instructions-on")
+    click("#check-on")
+    click("#instructions-on")
     for place in (1, 2):
         expect(page.locator("#practice-mark")).to_be_visible()
         seen(page)
         answer(page, "left")
         page.wait_for_selector(f"#progress-text:visible:has-text('{place + 1} of'), #begin:visible")
-    click("begin")
+    click("#begin")
     shown(page, "importance")
-    if answer is by_key:
+    if by == "keys":
         page.keyboard.type("25")
     else:
         for item, value in (("item-0", 2), ("item-1", 5)):
             page.check(f"input[name={item}][value='{value}']", force=True)
-    click("importance-on")
+    click("#importance-on")
     for place, choice in enumerate(("right", "equal", "unclear"), 1):
         shown(page, "pairs")
         expect(page.locator("#practice-mark")).to_be_hidden()
@@ -84,10 +82,7 @@ def test_ratings_from_start_to_end(page, by):
     fake = Fake(page="instructions", phase="testing")
     fake.open(page)
     page.click("#instructions-on")
-    fake.state["page"] = "importance"
     page.click("#begin")
-    fake.state["page"] = "ratings"
-    page.reload()
     for place, rating in enumerate((1, 7, 10), 1):
         shown(page, "ratings")
         seen(page)
@@ -115,7 +110,7 @@ def test_an_answer_before_both_clips_were_drawn_is_ignored(page, fake):
     page.keyboard.press("r")
     page.keyboard.press("ArrowLeft")
     answered(page, 1)
-    told = fake.answers[1]
+    told = fake.answers[0]
     assert told["choice"] == "left"
     assert told["replays"] == 1
     least = 30 * 50 / 50  # no frame moves a clip by more than 50 ms
@@ -141,9 +136,9 @@ def test_many_clicks_store_one_answer(page, fake, clicks):
         page.keyboard.press("ArrowDown")
     shown(page, "done")
     assert [(body["place"], body["choice"]) for body in fake.posted("/api/answer")] == [
-        (1, "left"),
-        (2, "right"),
-        (3, "equal"),
+        (0, "left"),
+        (1, "right"),
+        (2, "equal"),
     ]
 
 
@@ -173,7 +168,7 @@ def test_what_is_lost_on_the_way_is_sent_again_under_the_same_id(page, fake, com
     seen(page)
     page.keyboard.press("ArrowRight")
     answered(page, 2)
-    assert fake.answers[2]["request"] != first["request"]
+    assert fake.answers[1]["request"] != first["request"]
     complaints[:] = [text for text in complaints if not LOST.search(text)]
 
 
@@ -187,7 +182,7 @@ def test_a_reload_sends_what_the_server_doesnt_have_yet(page, fake, complaints):
     fake.lost = 0
     page.reload()
     page.wait_for_selector("#progress-text:has-text('2 of 3')")
-    assert fake.answers[1]["choice"] == "left"
+    assert fake.answers[0]["choice"] == "left"
     assert page.evaluate("history.state") is None
     complaints[:] = [text for text in complaints if not LOST.search(text)]
 
@@ -213,9 +208,10 @@ def test_two_tabs_ask_nothing_twice(context, page, fake, complaints):
     page.keyboard.press("ArrowLeft")
     answered(page, 1)
     other.keyboard.press("ArrowRight")  # refused: it was answered in the first tab
-    answered(other, 1)
-    assert fake.answers[1]["choice"] == "left"
+
+    assert fake.answers[0]["choice"] == "left"
     expect(other.locator("#progress-text")).to_have_text("Pair 2 of 3")
+    expect(other.locator("#pair-hint")).to_contain_text("answered already")
     complaints[:] = [text for text in complaints if not LOST.search(text)]
 
 
@@ -232,28 +228,35 @@ def test_a_hidden_tab_watches_nothing(page, fake):
     seen(page)
     page.keyboard.press("ArrowLeft")
     answered(page, 1)
-    told = fake.answers[1]
+    told = fake.answers[0]
     assert told["hidden_ms"] >= 850
     assert told["watched_ms"] < told["reaction_ms"] - 500 or told["reaction_ms"] < 900
 
 
 def test_who_waits_goes_on_alone(page, fake):
-    fake.state |= {"page": "wait", "seconds_to_wait": 0.2}
+    fake.state |= {"page": "wait", "seconds_to_wait": 42.0}
     fake.open(page)
     shown(page, "wait")
+    expect(page.locator("#wait-time")).to_have_text("About 42 seconds.")
     fake.state["page"] = "pairs"
     seen(page)
 
 
-def test_a_pair_that_isnt_there_yet_is_waited_for(page, fake):
+def test_who_waits_for_a_moment_sees_no_other_page(page, fake):
     told, waits = fake.reply, itertools.count()
-    fake.reply = lambda path, body: (
-        (200, {"wait": 0.2}) if path == "/api/pair" and next(waits) < 2 else told(path, body)
-    )
+    wait = lambda path: path == "/api/pair" and next(waits) == 1
+    fake.reply = lambda path, body: (200, {"wait": 2.0}) if wait(path) else told(path, body)
     fake.open(page)
-    shown(page, "wait")
     seen(page)
+    page.evaluate("""() => {
+        const wait = document.querySelector("[data-page=wait]");
+        const note = () => { if (!wait.hidden) document.title = "another page" };
+        new MutationObserver(note).observe(wait, {attributes: true});
+    }""")
+    page.keyboard.press("ArrowLeft")
+    answered(page, 1)
     assert next(waits) > 2
+    assert page.title() != "another page"
 
 
 def test_who_declines_is_asked_once_more(page, fake):
