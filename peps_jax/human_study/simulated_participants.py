@@ -156,9 +156,16 @@ class Door:
         self._connection.close()
 
     def _ask(self, method: str, path: str, body: str | None) -> Any:
-        self._connection.request(method, f"/api/{path}", body, self._headers)
-        reply = self._connection.getresponse()
-        content = json.loads(reply.read())
+        for again in (True, False):
+            try:
+                self._connection.request(method, f"/api/{path}", body, self._headers)
+                reply = self._connection.getresponse()
+                content = json.loads(reply.read())
+                break
+            except ConnectionError:  # closed meanwhile; a request that is made twice does what it does once
+                self._connection.close()
+                if not again:
+                    raise
         if reply.status != 200:
             raise RefusedError(f"{method} /api/{path}: {reply.status}, {content.get('error')}")
         return content
@@ -217,7 +224,7 @@ class Participant:
         answers = {
             name: int(value) for name, value in zip(names, np.resize(self._mind.importance, len(names)), strict=True)
         }
-        return self._door.post("importance", answers=answers, request=self._request())
+        return self._door.post("importance", answers=answers, request=_request())
 
     def _compare(self) -> Any:
         shown = self._door.get("pair")
@@ -256,11 +263,12 @@ class Participant:
         reaction = REACTION * float(np.exp(0.4 * self._chance.standard_normal()))
         return {
             "reaction_ms": round(reaction), "watched_ms": round(2_000 + reaction), "hidden_ms": 0, "replays": 0,
-            "request": self._request(),
+            "request": _request(),
         }  # fmt: skip
 
-    def _request(self) -> str:
-        return str(uuid.UUID(bytes=self._chance.bytes(16)))
+
+def _request() -> str:
+    return str(uuid.uuid4())
 
 
 def all_pairs(database: Database) -> list[Stimulus]:

@@ -429,7 +429,7 @@ def show(folder: Folder, result: Result, note: str) -> None:
     figure, scene = pictures.draw(result, note)
     files.write_with(folder.picture, lambda path: figure.savefig(path, dpi=110))
     see = jax.vmap(result.training.problem.environment.perceive)
-    route = np.round(np.asarray(see(drawing.states_of(scene))), 3).tolist()
+    route = np.round(np.asarray(see(drawing.states_of(scene)), np.float64), 3).tolist()
     files.write_whole(folder.routes, json.dumps({"note": note, "route": route}).encode())
 
 
