@@ -6,6 +6,7 @@ is known here alone: a page that is loaded anew asks `/api/state`.
 
     400  malformed     401  no token, or a wrong one     403  one of another phase, or for something else
     409  not now       413  too large                    429  too many wrong tokens
+    503  nothing can be kept at present
 """
 
 from __future__ import annotations
@@ -13,12 +14,15 @@ from __future__ import annotations
 import json
 import random
 import re
+import sqlite3
+import sys
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
@@ -196,7 +200,7 @@ class Study:
         """The pages of a phase, in their order."""
         if phase == "testing":
             return ["consent", "check", "instructions", "ratings", "done"]
-        importance = ["importance"] * bool(self.settings.importance)
+        importance = ["importance"] * (phase == "training" and bool(self.settings.importance))
         return ["consent", "check", "instructions", *importance, "pairs", "done"]
 
     def after(self, phase: str, page: str) -> str:
@@ -549,7 +553,12 @@ def application(study: Study) -> ASGIApp:
         get("/researcher", page("researcher.html")),
         get("/static/{name}", static),
     ]
-    errors = {RefusedError: _refused, ConflictError: _conflict}
+    errors = {
+        RefusedError: _refused,
+        ConflictError: _conflict,
+        HTTPException: _misdirected,
+        sqlite3.OperationalError: _busy,
+    }
     return _with_headers(Starlette(routes=routes, exception_handlers=errors))
 
 
@@ -569,6 +578,16 @@ async def _refused(request: Request, error: RefusedError) -> Response:
 
 async def _conflict(request: Request, error: ConflictError) -> Response:
     return JSONResponse({"error": str(error)}, 409)
+
+
+async def _misdirected(request: Request, error: HTTPException) -> Response:
+    return JSONResponse({"error": error.detail}, error.status_code, error.headers)
+
+
+async def _busy(request: Request, error: sqlite3.OperationalError) -> Response:
+    """The disk is full, or another process writes for very long: nothing is acknowledged, and the page asks again."""
+    print(f"database: {error}", file=sys.stderr, flush=True)
+    return JSONResponse({"error": "the server can't keep anything at present: try again"}, 503)
 
 
 def _with_headers(app: ASGIApp) -> ASGIApp:

@@ -4,6 +4,7 @@ import copy
 import json
 import re
 import socket
+import sqlite3
 import threading
 import uuid
 
@@ -13,6 +14,7 @@ from study_cases import Client, answer_to, invite, make_study, rating_of, served
 from peps_jax.human_study import tokens
 from peps_jax.human_study.database import Database
 from peps_jax.human_study.server import HEADERS, LARGEST, Study
+from peps_jax.human_study.serving import Serving
 
 AGENTS = ("peps", "sac", "drlhp")
 CHOICES = ("left", "right", "equal", "unclear")
@@ -413,6 +415,30 @@ def test_other_methods_are_refused(come):
         assert client.request(method, path)[0] == 405
 
 
+def test_what_cannot_be_kept_is_not_acknowledged(serving, come, monkeypatch, capsys):
+    client = come()
+    client.get("/api/pair")
+
+    def full(*values, **named):
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr(serving.study.database, "answer", full)
+    body = answer_to(0)
+    assert client.request("POST", "/api/answer", body)[0] == 503
+    monkeypatch.undo()
+    assert client.get("/api/state")["progress"]["done"] == 0
+    assert client.request("POST", "/api/answer", body)[0] == 200
+    assert "disk is full" in capsys.readouterr().err
+
+
+def test_every_error_is_a_line_of_json(come):
+    client = come()
+    for method, path in (("GET", "/api/nothing"), ("POST", "/api/state"), ("GET", "/static/nothing.js")):
+        status, reply = client.request(method, path)
+        assert status in (404, 405)
+        assert set(reply) == {"error"}
+
+
 def test_every_reply_forbids_what_pages_do_not_need(serving, come):
     client = come()
     for path in ("/", "/api/state", "/api/nothing", "/static/nothing.js", "/api/researcher"):
@@ -426,6 +452,34 @@ def test_every_reply_forbids_what_pages_do_not_need(serving, come):
 def test_nobody_but_this_machine_is_listened_to(serving):
     assert serving.address.startswith("http://127.0.0.1:")
     assert serving._socket.getsockname()[0] == "127.0.0.1"
+
+
+@pytest.mark.parametrize(("behind", "statuses"), [(True, {401}), (False, {401, 429})])
+def test_where_requests_come_from_is_believed_of_a_proxy_alone(folder, behind, statuses):
+    serving = Serving(Study(folder), behind_proxy=behind)
+    try:
+        with serving.in_background():
+            client = Client(serving.address, "wrong")
+            found = {
+                client.request("GET", "/api/state", headers={"X-Forwarded-For": f"10.0.0.{number}"})[0]
+                for number in range(tokens.WRONG + 5)
+            }
+            client.close()
+    finally:
+        serving.close()
+    assert found == statuses
+
+
+def test_ids_are_erased_beside_a_running_server(platform_link, folder, serving):
+    client = platform_link()
+    client.begin(sent("erasable person", "session"))
+    pair = client.get("/api/pair")
+    database = Database(folder.database)
+    assert database.erase() >= 1
+    database.close()
+    everything = b"".join(path.read_bytes() for path in folder.path.glob("study.sqlite*"))
+    assert b"erasable" not in everything
+    assert client.get("/api/pair") == pair
 
 
 # --- platforms ----------------------------------------------------------------------------------------------------------------
