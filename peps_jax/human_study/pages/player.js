@@ -1,5 +1,8 @@
 // Plays clips side by side, all from their start on, and counts what was drawn of them.
 //
+// They play at the same time, again and again: both begin alike, so a difference is seen when it happens, nothing has to be
+// remembered from one to the other, and neither is the one that was seen last. It takes half the time, too.
+//
 // Time is what was drawn: a frame moves the clips by at most LONGEST, and nothing moves or counts while the page is hidden. So a
 // clip that has come to its end was on the screen from its start to its end.
 

@@ -9,7 +9,7 @@ const FLASH = 180; // ms for which one sees what one has chosen
 const WAITS = [300, 700, 1500, 3000]; // ms between questions of one who waits; the last one from then on
 const LONG = 5; // s of waiting from which on it is said how long
 const ENOUGH = { frames: 25, width: 600, height: 480 }; // frames a second, pixels
-const MEASURED = 1500; // ms for which frames are counted
+const MEASURED = 1000; // ms for which frames are counted
 const PLATFORMS = ["PROLIFIC_PID", "STUDY_ID", "SESSION_ID", "workerId", "assignmentId", "hitId", "turkSubmitTo"];
 const PREVIEW = "ASSIGNMENT_ID_NOT_AVAILABLE"; // MTurk's, while somebody only looks
 const MEANINGS = ["not important", "slightly important", "important", "very important", "most important"];
@@ -51,7 +51,8 @@ async function sendKept() {
   const kept = history.state?.kept;
   if (!kept) return;
   try {
-    await send(kept.path, kept.body);
+    const { token: own } = await send(kept.path, kept.body);
+    if (own) enter(own);
   } catch (error) {
     if (!(error instanceof Refused)) throw error;
   }
@@ -132,8 +133,7 @@ function still() {
 }
 
 function paragraphs(box, texts) {
-  const made = (text) => Object.assign(document.createElement("p"), { textContent: text });
-  box.replaceChildren(...texts.map(made));
+  box.replaceChildren(...texts.map((text) => made("p", {}, text)));
 }
 
 function progress(done, total, text) {
@@ -212,11 +212,7 @@ async function check() {
   onClick($("check-again"), () => check());
   enable([$("check-on")], false);
   $("check-again").hidden = $("check-advice").hidden = true;
-  const items = ["Picture", "Window", "Keys or touch"].map((text) => {
-    const item = document.createElement("li");
-    item.textContent = text;
-    return item;
-  });
+  const items = ["Picture", "Window", "Keys or touch"].map((text) => made("li", {}, text));
   $("checks").replaceChildren(...items);
   const touch = matchMedia("(pointer: coarse)").matches;
   Object.assign(report, {
@@ -330,19 +326,21 @@ function importance(state) {
 }
 
 function importanceOf(item, place) {
-  const make = (kind, properties, ...children) => {
-    const made = Object.assign(document.createElement(kind), properties);
-    made.append(...children);
-    return made;
-  };
-  const text = make("p", { id: `item-${place}`, textContent: item.text });
+  const text = made("p", { id: `item-${place}` }, item.text);
   const steps = MEANINGS.map((meaning, step) => {
-    const input = make("input", { type: "radio", name: `item-${place}`, value: step + 1, ariaLabel: `${step + 1}, ${meaning}` });
-    return make("label", {}, input, String(step + 1));
+    const input = made("input", { type: "radio", name: text.id, value: step + 1, "aria-label": `${step + 1}, ${meaning}` });
+    return made("label", {}, input, String(step + 1));
   });
-  const group = make("div", { className: "steps", role: "radiogroup" }, ...steps);
-  group.setAttribute("aria-labelledby", text.id);
-  return make("div", { className: "item" }, text, group);
+  const group = made("div", { class: "steps", role: "radiogroup", "aria-labelledby": text.id }, ...steps);
+  return made("div", { class: "item" }, text, group);
+}
+
+/** A new element with these attributes and children; texts stay texts. */
+function made(kind, attributes, ...children) {
+  const element = document.createElement(kind);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+  element.append(...children);
+  return element;
 }
 
 // --- pairs and ratings ------------------------------------------------------------------------------------------------------
@@ -399,7 +397,7 @@ function compared(pair, practice = false) {
 function rated(scene) {
   const numbers = [...Array(10).keys()].map((place) => place + 1);
   if (!$("ratings").children.length) {
-    $("ratings").append(...numbers.map((number) => Object.assign(document.createElement("button"), { textContent: number })));
+    $("ratings").append(...numbers.map((number) => made("button", {}, String(number))));
     $("ratings").children[0].setAttribute("aria-label", "1, not at all");
     $("ratings").children[9].setAttribute("aria-label", "10, exactly");
   }

@@ -5,21 +5,28 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
-pytest.importorskip("playwright", reason="Playwright isn't installed: the pages aren't tried in a browser")
-from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
-
 from browser.fake import Complaints, Fake
 
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, BrowserContext, Page
 
-@pytest.fixture(scope="session")
+
+@pytest.fixture(scope="package")  # longer, its event loop would be in other tests' way
 def browser() -> Iterator[Browser]:
-    path = os.environ.get("PLAYWRIGHT_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
-    if path is None:
-        pytest.skip("there is no Chromium: install one, or name it in PLAYWRIGHT_CHROMIUM")
-    with sync_playwright() as playwright:
+    reason = "Playwright isn't installed: the pages aren't tried in a browser"
+    api = pytest.importorskip("playwright.sync_api", reason=reason)
+    with api.sync_playwright() as playwright:
+        own = playwright.chromium.executable_path
+        path = (
+            os.environ.get("PLAYWRIGHT_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser") or own
+        )
+        if not Path(path).exists():
+            pytest.skip("there is no Chromium: install one, or name it in PLAYWRIGHT_CHROMIUM")
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
         yield browser
         browser.close()
@@ -35,7 +42,7 @@ def complaints() -> Iterator[Complaints]:
 
 @pytest.fixture
 def context(browser, complaints) -> Iterator[BrowserContext]:
-    context = browser.new_context(viewport={"width": 1366, "height": 768})
+    context = browser.new_context(viewport={"width": 1024, "height": 640})
     context.set_default_timeout(10_000)
     complaints.watch(context)
     yield context

@@ -6,10 +6,11 @@ import json
 import mimetypes
 from collections.abc import Callable
 from importlib import resources
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from playwright.sync_api import BrowserContext, ConsoleMessage, Page, Route
+if TYPE_CHECKING:
+    from playwright.sync_api import BrowserContext, ConsoleMessage, Page, Route
 
 PAGES = resources.files("peps_jax.human_study") / "pages"
 ORIGIN = "http://study.test"

@@ -100,3 +100,27 @@ def test_a_scene_is_drawn_where_it_is(page, fake, box, y_down, size, red, blue):
     drawn = page.evaluate(DRAW, [view, scene, *box, [red, blue, (size[0] // 2, size[1] // 2)]])
     assert tuple(drawn["size"]) == size
     assert drawn["pixels"] == [RED, BLUE, GREY]
+
+
+SPEED = """async ([view, clips, frames]) => {
+    const { Clip } = await import("/static/clip.js");
+    const { draw, fit } = await import("/static/drawing.js");
+    const stages = clips.map((clip) => {
+        const canvas = document.createElement("canvas");
+        return { canvas, room: fit(canvas, view, 640, 400), clip: new Clip(view, clip) };
+    });
+    const begin = performance.now();
+    for (let frame = 0; frame < frames; frame++) {
+        for (const { canvas, room, clip } of stages) draw(canvas, clip.sceneAt((clip.steps * frame) / frames), room, view.colours);
+    }
+    return (performance.now() - begin) / frames;
+}"""
+
+
+@pytest.mark.parametrize("name", ["highway-rain", "nav-d4"])
+def test_a_browser_draws_a_pair_sixty_times_a_second(page, fake, name):
+    task, states = CASES[name]
+    encoded = clips.encode(task.environment, task.params, *states(task, STEPS), np.ones(STEPS, bool))
+    fake.open(page)
+    each = page.evaluate(SPEED, [clips.view(task.environment, task.params), [encoded, encoded], 300])
+    assert each < 1000 / 60  # ms

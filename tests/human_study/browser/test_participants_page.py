@@ -4,14 +4,14 @@ import itertools
 import re
 
 import pytest
-from playwright.sync_api import expect
 
 from browser.fake import ORIGIN, STEPS, Fake, clicking, hide
 
+expect = pytest.importorskip("playwright.sync_api", reason="Playwright isn't installed").expect
+
+# what browsers write to the console of a connection or a refusal
+LOST = re.compile("net::ERR_|Failed to load resource")
 KEYS = {"left": "ArrowLeft", "right": "ArrowRight", "equal": "ArrowDown", "unclear": "ArrowUp"}
-LOST = re.compile(
-    "net::ERR_|Failed to load resource"
-)  # what browsers write to the console of a connection or a refusal
 
 
 def shown(page, name):

@@ -3,9 +3,10 @@
 import io
 
 import pytest
-from playwright.sync_api import expect
 
 from browser.fake import ORIGIN
+
+expect = pytest.importorskip("playwright.sync_api", reason="Playwright isn't installed").expect
 
 
 def person(number, **changes):

@@ -10,12 +10,13 @@ from unittest import mock
 
 import pytest
 import study_cases
-from playwright.sync_api import expect
 from study_cases import Client, invite, make_study, served
 
 from browser.fake import VIEW, clicking, clip
 from peps_jax.human_study.database import Database, Stimulus
 from peps_jax.storage import files
+
+expect = pytest.importorskip("playwright.sync_api", reason="Playwright isn't installed").expect
 
 PAIRS = 6
 LANES = (0, 400)  # of the car in the first clip of a pair and in the second
