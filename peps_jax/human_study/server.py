@@ -42,7 +42,7 @@ from peps_jax.human_study.database import (
     Wait,
     Watching,
 )
-from peps_jax.human_study.settings import Folder
+from peps_jax.human_study.settings import FIXED, Folder
 
 PAGES = Path(__file__).parent / "pages"
 STATIC = re.compile(r"[a-z0-9_-]+\.(js|css|svg)")
@@ -58,6 +58,9 @@ UUID = re.compile(r"[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}
 DAY = 86_400_000  # ms
 MOST = 10**9
 FIELDS, CHARACTERS = 30, 200  # of a browser's report, and of a text from outside
+
+
+ORDER = ("consent", "check", "instructions", "importance", "pairs", "ratings", "done")  # of pages
 
 
 class RefusedError(Exception):
@@ -77,21 +80,24 @@ class Study:
 
     def __init__(self, folder: Folder):
         folder.check()
-        self.folder, self.settings = folder, folder.settings()
-        self.database, self.key = Database(folder.database), tokens.read_key(folder.key)
-        self._check_unchanged()
+        self.folder, self.settings, self.key = folder, folder.settings(), tokens.read_key(folder.key)
+        self.database = Database(folder.database)
+        try:
+            self._check_unchanged()
+        except ValueError:
+            self.database.close()
+            raise
         self.researcher = tokens.digest(tokens.derived(self.key, "researcher"))
         self.guesses = tokens.WrongGuesses()
         self.last_seen: dict[int, float] = {}  # by participant, time.monotonic()
 
     def _check_unchanged(self) -> None:
         made = self.database.noted("made")
-        for field in ("env", "test_env", "seed"):
-            if getattr(self.settings, field) != made[field]:
-                raise ValueError(
-                    f"{self.folder.file.name}: {field} {getattr(self.settings, field)!r} can't be changed any more: the study was "
-                    f"made with {made[field]!r}"
-                )
+        for field in FIXED:
+            value = getattr(self.settings, field)
+            if value != made[field]:
+                name = self.folder.file.name
+                raise ValueError(f"{name}: {field} {value!r} can't be changed: the study was made with {made[field]!r}")
 
     # --- where somebody is ------------------------------------------------------------------------------------------------------
 
@@ -125,6 +131,9 @@ class Study:
 
     def _now(self, who: Participant) -> tuple[Participant, bool]:
         """The participant, whose end is noted if there is nothing more to show; and whether they wait for something."""
+        if who.page == "importance" and "importance" not in self.pages(who.phase):  # it was taken out meanwhile
+            self.database.turn(who.number, "importance", "pairs")
+            who = self.database.participant(who.number)
         if who.page not in ("pairs", "ratings"):
             return who, False
         more = self.database.has_more(who.number)
@@ -198,10 +207,10 @@ class Study:
 
     def pages(self, phase: str) -> list[str]:
         """The pages of a phase, in their order."""
-        if phase == "testing":
-            return ["consent", "check", "instructions", "ratings", "done"]
-        importance = ["importance"] * (phase == "training" and bool(self.settings.importance))
-        return ["consent", "check", "instructions", *importance, "pairs", "done"]
+        left_out = {"importance", "pairs"} if phase == "testing" else {"ratings"}
+        if phase == "label" or not self.settings.importance:
+            left_out |= {"importance"}
+        return [page for page in ORDER if page not in left_out]
 
     def after(self, phase: str, page: str) -> str:
         pages = self.pages(phase)
@@ -209,8 +218,7 @@ class Study:
 
     def proceed(self, who: Participant, page: str, report: Mapping[str, Any] | None) -> dict[str, Any]:
         """They are done with the browser check or the instructions."""
-        pages = self.pages(who.phase)
-        if pages.index(who.page) < pages.index(page):
+        if ORDER.index(who.page) < ORDER.index(page):
             raise ConflictError(f"The page {page} comes later: ask for the state.")
         self.database.turn(who.number, page, self.after(who.phase, page), report)
         return self.state(who)
@@ -363,11 +371,10 @@ _ANSWER = {"place": _whole(0, MOST), "choice": _one_of(*CHOICES), "frames": _sid
 _RATING = {"place": _whole(0, MOST), "rating": _whole(1, 10), "frames": _frames, "request": _request_id} | _WATCHED
 
 
-_ANSWERED, _RATED = ("place", "choice", "frames", "request"), ("place", "rating", "frames", "request")
-
-
-def _watching(read: Mapping[str, Any]) -> Watching:
-    return Watching(*(read[name] for name in Watching._fields))
+def _watched(read: dict[str, Any]) -> dict[str, Any]:
+    """What was read of an answer or a rating, with how it was watched as one."""
+    watching = Watching(*(read.pop(name) for name in Watching._fields))
+    return read | {"watching": watching}
 
 
 async def _body(request: Request) -> Any:
@@ -406,7 +413,7 @@ def application(study: Study) -> ASGIApp:
     an answer, and only one can write at a time anyway. Handing it to other threads took longer on a busy machine.
     """
 
-    async def holder(request: Request) -> Participant | Link | None:
+    def holder(request: Request) -> Participant | Link | None:
         """Who asks: a participant, somebody with a link's token, or None, the researcher."""
         scheme, _, token = request.headers.get("authorization", "").partition(" ")
         digest = tokens.digest(token)
@@ -423,15 +430,15 @@ def application(study: Study) -> ASGIApp:
             study.guesses.wrong(address)
         raise RefusedError(401, "open the link that you were given: there is no right token in this one")
 
-    async def anybody(request: Request) -> Participant | Link:
-        who = await holder(request)
+    def anybody(request: Request) -> Participant | Link:
+        who = holder(request)
         if who is None:
             raise RefusedError(403, "this is the researcher's link: participants have their own")
         return who
 
-    async def participant(request: Request, *pages: str) -> Participant:
+    def participant(request: Request, *pages: str) -> Participant:
         """A participant in a phase that has one of `pages`."""
-        who = await anybody(request)
+        who = anybody(request)
         if isinstance(who, Link):
             raise RefusedError(403, "agree to take part first")
         if not set(pages) & set(study.pages(who.phase)):
@@ -440,42 +447,42 @@ def application(study: Study) -> ASGIApp:
             raise RefusedError(403, "agree to take part first")
         return who
 
-    async def researcher(request: Request) -> None:
-        if await holder(request) is not None:
+    def researcher(request: Request) -> None:
+        if holder(request) is not None:
             raise RefusedError(403, "this needs the researcher's link")
 
     async def state(request: Request) -> Response:
-        return JSONResponse(study.state(await anybody(request)))
+        return JSONResponse(study.state(anybody(request)))
 
     async def consent(request: Request) -> Response:
-        who = await anybody(request)
+        who = anybody(request)
         read = _record(await _body(request), {"agreed": _boolean, "platform": _platform})
         return JSONResponse(study.consent(who, read["agreed"], read["platform"]))
 
     async def proceed(request: Request) -> Response:
-        who = await participant(request, "check")
+        who = participant(request, "check")
         fields = {"page": _one_of("check", "instructions"), "report": _report}
         read = _record({"report": {}} | _object(await _body(request)), fields)
         return JSONResponse(study.proceed(who, read["page"], read["report"] or None))
 
     async def importance(request: Request) -> Response:
-        who = await participant(request, "importance")
+        who = participant(request, "importance")
         names = [one.name for one in study.settings.importance]
         scale = lambda value: _record(value, dict.fromkeys(names, _whole(1, 5)), "answers")
         read = _record(await _body(request), {"answers": scale, "request": _request_id})
         return JSONResponse(study.importance(who, read["answers"], read["request"]))
 
     async def practice(request: Request) -> Response:
-        await participant(request, "pairs")
+        participant(request, "pairs")
         return _json(study.practice())
 
     async def view(request: Request) -> Response:
-        who = await anybody(request)
+        who = anybody(request)
         return _json(study.view(who.phase))
 
     def shows(page: str) -> Handler:
         async def show(request: Request) -> Response:
-            who = await participant(request, page)
+            who = participant(request, page)
             if who.page == "done":
                 return _json('{"done": true}')
             if who.page != page:
@@ -485,23 +492,23 @@ def application(study: Study) -> ASGIApp:
         return show
 
     async def answer(request: Request) -> Response:
-        who = await participant(request, "pairs")
+        who = participant(request, "pairs")
         read = _record(await _body(request), _ANSWER)
-        study.database.answer(who.number, watching=_watching(read), **{name: read[name] for name in _ANSWERED})
+        study.database.answer(who.number, **_watched(read))
         return JSONResponse({"ok": True, "state": study.state(who)})
 
     async def rating(request: Request) -> Response:
-        who = await participant(request, "ratings")
+        who = participant(request, "ratings")
         read = _record(await _body(request), _RATING)
-        study.database.rate(who.number, watching=_watching(read), **{name: read[name] for name in _RATED})
+        study.database.rate(who.number, **_watched(read))
         return JSONResponse({"ok": True, "state": study.state(who)})
 
     async def overview(request: Request) -> Response:
-        await researcher(request)
+        researcher(request)
         return JSONResponse(study.overview())
 
     async def picture(request: Request) -> Response:
-        await researcher(request)
+        researcher(request)
         try:
             content = study.folder.picture.read_bytes()
         except FileNotFoundError:
@@ -509,7 +516,7 @@ def application(study: Study) -> ASGIApp:
         return Response(content, media_type="image/png")
 
     async def close_round(request: Request) -> Response:
-        await researcher(request)
+        researcher(request)
         read = _record(await _body(request), {"round": _whole(0, MOST)})
         try:
             why = study.database.close_round(read["round"])

@@ -157,6 +157,21 @@ def test_pages_come_in_their_order(come):
     assert client.get("/api/practice")["pairs"][0].keys() == {"left", "right"}
 
 
+def test_importance_may_be_taken_out_meanwhile(tmp_path):
+    folder = make_study(tmp_path / "study", pairs=20)
+    (token,) = invite(folder)
+    with served(folder) as serving:
+        client = Client(serving.address, token)
+        client.post("/api/consent", {"agreed": True, "platform": {}})
+        client.post("/api/proceed", {"page": "check"})
+        assert client.post("/api/proceed", {"page": "instructions"})["page"] == "importance"
+    folder.file.write_text(folder.file.read_text().split("[[importance]]")[0])
+    with served(folder) as serving:
+        client = Client(serving.address, token)
+        assert client.post("/api/proceed", {"page": "instructions"})["page"] == "pairs"
+        assert client.get("/api/pair")["place"] == 0
+
+
 # --- answers ------------------------------------------------------------------------------------------------------------------
 
 
@@ -600,5 +615,5 @@ def test_a_round_is_closed_by_hand(tmp_path):
 def test_a_study_whose_environment_was_changed_is_refused(tmp_path):
     folder = make_study(tmp_path / "changed")
     folder.file.write_text(folder.file.read_text().replace('env = "highway-dry"', 'env = "nav-d4"', 1))
-    with pytest.raises(ValueError, match="env 'nav-d4' can't be changed any more"):
+    with pytest.raises(ValueError, match="env 'nav-d4' can't be changed: the study was made with 'highway-dry'"):
         Study(folder)
