@@ -153,14 +153,16 @@ def tests(found: Rated) -> list[Row]:
     return rows
 
 
-def agents(found: Rated) -> list[Row]:
-    """Each agent's ratings, with intervals over raters."""
+def agents(found: Rated, road: bool) -> list[Row]:
+    """Each agent's ratings, with intervals over raters; on a road the paper's beside them."""
     rows = []
     for place, agent in enumerate(found.agents):
         told = statistics.bootstrap(lambda rated: rated[..., place].mean(-1), found.means)  # noqa: B023
-        paper = "{} ± {}".format(*report.PAPER[agent]) if agent in report.PAPER else ""
         row = {"agent": agent, "mean": told.value, "low": told.low, "high": told.high}
-        rows.append(row | {"sd": float(np.std(found.means[:, place], ddof=1)), "paper": paper})
+        row["sd"] = float(np.std(found.means[:, place], ddof=1))
+        if road and agent in report.PAPER:
+            row["paper's"] = "{} ± {}".format(*report.PAPER[agent])
+        rows.append(row)
     return rows
 
 
@@ -313,7 +315,7 @@ def figure3(folder: Folder, database: Database, found: Rated, note: str) -> Figu
 
 
 def _routes(scenes: Mapping[str, tuple[str, Segments]], params: Any, note: str) -> Figure:
-    figure, grid = panels_of(1, len(scenes), 2.6, 2.9)
+    figure, grid = panels_of(1, len(scenes), 2.6, 3.3)
     for axes, (title, (agent, rows)) in zip(grid[0], scenes.items(), strict=True):
         draw_map(axes, params)
         for place in range(min(len(rows.mask), ROUTES)):
@@ -357,19 +359,19 @@ def _colours(names: Sequence[str]) -> list[str]:
 
 def predictions_figure(rows: Sequence[Row]) -> Figure:
     """Which share of each participant's answers r-hat and their own importance ratings predict."""
-    figure, ((axes,),) = panels_of(1, 1, 4.6, 3.4)
+    names = {"r̂ predicts": "by r̂", "importance predicts": "by their own importance ratings"}
+    there = [name for name in names if any(name in row for row in rows)]
+    figure, ((axes,),) = panels_of(1, 1, 1.0 + 1.8 * len(there), 3.4)
     tidy(axes)
-    shown = {"r̂ predicts": colours(1)[0], "importance predicts": colours(2)[1]}
-    for column, (name, colour) in enumerate(shown.items()):
+    for column, (name, colour) in enumerate(zip(there, colours(len(there)), strict=True)):
         values = np.array([row[name] for row in rows if name in row])
-        if values.size:
-            aside = np.random.default_rng(column).uniform(-0.1, 0.1, values.size)
-            axes.plot(column + aside, values, "o", color=colour, markersize=4, alpha=0.6)
-            axes.plot([column - 0.2, column + 0.2], [values.mean()] * 2, color=colour, linewidth=2.5)
+        aside = np.random.default_rng(column).uniform(-0.1, 0.1, values.size)
+        axes.plot(column + aside, values, "o", color=colour, markersize=4, alpha=0.6)
+        axes.plot([column - 0.2, column + 0.2], [values.mean()] * 2, color=colour, linewidth=2.5)
     axes.axhline(0.5, color=QUIET, linewidth=0.9, linestyle=(0, (4, 3)))
-    axes.set_xticks([0, 1], ["by r̂", "by their own importance ratings"])
-    axes.set(xlim=(-0.5, 1.5), ylim=(0, 1.02))
-    axes.set_ylabel("share of a participant's answers predicted", color=INK, fontsize=9)
+    axes.set_xticks(range(len(there)), [names[name] for name in there])
+    axes.set(xlim=(-0.5, len(there) - 0.5), ylim=(0, 1.02))
+    axes.set_ylabel("share of a participant's answers", color=INK, fontsize=9)
     return figure
 
 
@@ -379,12 +381,13 @@ def power_figure(plan: Sequence[power.Planned], note: str) -> Figure:
     tidy(axes)
     raters = [one.raters for one in plan]
     names = {"main": "repeated measures", "one_way": "one-way (the paper's)", "first_best": "and the first agent best"}
-    for (field, name), colour in zip(names.items(), colours(3), strict=True):
+    for (field, name), colour, line in zip(names.items(), colours(3), ("-", "--", ":"), strict=True):
         shares = [getattr(one, field) for one in plan]
-        axes.plot(raters, [one.share for one in shares], color=colour, label=name, marker="o", markersize=3)
+        axes.plot(raters, [one.share for one in shares], line, color=colour, label=name, marker="o", markersize=3)
         axes.fill_between(raters, [one.low for one in shares], [one.high for one in shares], color=colour, alpha=0.15)
     axes.axhline(power.POWER, color=QUIET, linewidth=0.9, linestyle=(0, (4, 3)))
-    axes.set(ylim=(0, 1.02))
+    axes.set(ylim=(0, 1.04))
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_xlabel("raters", color=INK, fontsize=9)
     axes.set_ylabel(f"studies with p < {power.ALPHA}", color=INK, fontsize=9)
     axes.legend(frameon=False, fontsize=8, loc="lower right")
@@ -428,7 +431,11 @@ def _write(folder: Folder, database: Database) -> list[Path]:
         words = power.said(plan, people)
         main = statistics.repeated_measures(found.means)
         note = f"{people}; repeated-measures ANOVA: p = {main.corrected_p:.2g}"
-        made |= {"agents": agents(found), "tests": tests(found), "pairs": agents_by_pairs(found)}
+        made |= {
+            "agents": agents(found, pairs.is_road(folder.settings().test_env)),
+            "tests": tests(found),
+            "pairs": agents_by_pairs(found),
+        }
         made["power"] = [
             {"raters": one.raters, "repeated measures": one.main.share, "one-way": one.one_way.share,
              "and the first agent best": one.first_best.share} for one in plan
@@ -437,7 +444,7 @@ def _write(folder: Folder, database: Database) -> list[Path]:
         figures["ratings"] = ratings_figure(found, made["agents"], note)
         figures["power"] = power_figure(plan, words)
     if made["predictions"]:
-        figures["agreement"] = predictions_figure(made["predictions"])
+        figures["predictions"] = predictions_figure(made["predictions"])
     paths = [target / TEXT, target / NUMBERS]
     files.write_whole(target / TEXT, text(tables, made, words).encode())
     files.write_whole(target / NUMBERS, files.json_bytes(_plain(made)))

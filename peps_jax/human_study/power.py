@@ -16,7 +16,7 @@ from peps_jax.human_study import statistics
 from peps_jax.human_study.statistics import Share
 
 ALPHA, POWER = 0.05, 0.8
-FEWEST, MOST = 3, 60  # raters that are tried
+FEWEST, SHOWN, MOST = 3, 10, 60  # raters that are tried: at least up to the second number
 STUDIES = 1_000  # drawn for each number of raters
 
 
@@ -55,7 +55,7 @@ def power(ratings: ArrayLike, raters: int, studies: int = STUDIES, seed: int = 0
 
 
 def plan(ratings: ArrayLike, most: int = MOST) -> list[Planned]:
-    """`power` for every number of raters up to the first that reaches `POWER`, and a few beyond; up to `most` if none does.
+    """`power` for every number of raters up to twice the first that reaches `POWER`; up to `most` if none does.
 
     Raises:
       ValueError: fewer than two raters or agents.
@@ -65,7 +65,7 @@ def plan(ratings: ArrayLike, most: int = MOST) -> list[Planned]:
     for raters in range(FEWEST, most + 1):
         planned.append(power(ratings, raters))
         enough = needed(planned)
-        if enough is not None and raters >= min(2 * enough, most):
+        if enough is not None and raters >= max(2 * enough, SHOWN):
             break
     return planned
 
@@ -85,12 +85,12 @@ def said(planned: list[Planned], source: str) -> str:
       source: of the ratings, such as "40 simulated raters".
     """
     enough = needed(planned)
-    tried = f"of {STUDIES} studies each, drawn from {source}"
+    tried = f"in {STUDIES} studies drawn from {source}"
     if enough is None:
         last = planned[-1]
-        return f"{last.raters} raters find a difference (p < {ALPHA}) in {last.main.share:.0%} {tried}: more are needed"
+        return f"{last.raters} raters find a difference (p < {ALPHA}) with power {last.main.share:.2f} {tried}: more are needed"
     found = next(one for one in planned if one.raters == enough)
     return (
-        f"{enough} raters find a difference (p < {ALPHA}) with power {found.main.share:.2f} {tried}; "
-        f"the paper's one-way test with {found.one_way.share:.2f}"
+        f"{enough} raters find a difference (p < {ALPHA}) with power {found.main.share:.2f} {tried}; the paper's one-way test has "
+        f"{found.one_way.share:.2f}"
     )

@@ -100,8 +100,8 @@ def test_tests_are_those_of_the_ratings(tables):
     first = analysis.agents_by_pairs(found)[0]
     assert (first["first"], first["second"]) == ("peps", "sac")
     assert first["low"] < first["difference"] < first["high"]
-    peps, *_ = analysis.agents(found)
-    assert peps["paper"] == "7.6 ± 2.4"
+    assert analysis.agents(found, road=True)[0]["paper's"] == "7.6 ± 2.4"
+    assert "paper's" not in analysis.agents(found, road=False)[0]
 
 
 def test_agreement_is_of_those_who_count(tables):
@@ -121,7 +121,9 @@ def test_predictions_are_of_each_who_counts(folder, tables):
 
 def test_everything_is_written(folder):
     written = {path.name: path for path in analysis.write(folder)}
-    assert {"analysis.md", "analysis.json", "figure3.png", "ratings.png", "power.png", "agreement.png"} <= set(written)
+    assert {"analysis.md", "analysis.json", "figure3.png", "ratings.png", "power.png", "predictions.png"} <= set(
+        written
+    )
     words = written["analysis.md"].read_text(encoding="utf-8")
     for part in (
         "repeated-measures ANOVA (main)",
