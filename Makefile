@@ -58,4 +58,4 @@ $(READY): requirements.lock pyproject.toml
 lock: $(READY)
 	$(BIN)/pip install --quiet uv
 	echo hatchling | $(BIN)/uv pip compile --upgrade --universal --no-header --no-annotate --no-emit-index-url \
-		--no-emit-find-links --extra test --extra docs pyproject.toml - --output-file requirements.lock
+		--no-emit-find-links --extra test --extra docs --extra study --extra browser pyproject.toml - --output-file requirements.lock

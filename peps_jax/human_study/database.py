@@ -611,42 +611,35 @@ class Database:
 
     def _query_for(self, connection: sqlite3.Connection, assignment: sqlite3.Row) -> int | None:
         """The query that somebody is shown at an assignment that has none yet; None if there is none."""
-        participant, kind = assignment["participant"], assignment["kind"]
-        if kind == "repeat":
+        participant = assignment["participant"]
+        if assignment["kind"] == "repeat":
             row = connection.execute(
                 "SELECT query FROM assignment WHERE participant = ? AND place = ?", (participant, assignment["repeats"])
             ).fetchone()
             return None if row is None else row[0]
-        if kind not in ("ask", "shared"):
+        if assignment["kind"] not in ("ask", "shared"):
             return None
         seed = connection.execute("SELECT seed FROM participant WHERE number = ?", (participant,)).fetchone()[0]
-        chance = random.Random(f"{seed} {assignment['place']}")
-        unseen = "NOT EXISTS (SELECT 1 FROM assignment WHERE query = query.number AND participant = :participant)"
-        free = (
-            "NOT EXISTS (SELECT 1 FROM assignment WHERE query = query.number AND answered = 0 AND lease > :now "
-            "AND participant != :participant)"
-        )
-        values = {"participant": participant, "now": self._clock()}
-
-        def draw(where: str, order: str = "answered, luck") -> int | None:
+        for where, order in self._wishes(assignment["kind"]):
             found = connection.execute(
-                f"SELECT number, answered FROM query WHERE kind = 'ask' AND {where} AND {unseen} "
+                f"SELECT number, answered FROM query WHERE kind = 'ask' AND {where} AND {_UNSEEN} "
                 f"ORDER BY {order} LIMIT {DRAWN_FROM}",
-                values,
+                {"participant": participant, "now": self._clock()},
             ).fetchall()
             alike = [row["number"] for row in found if row["answered"] == found[0]["answered"]]
-            return chance.choice(alike) if alike else None
-
-        if self.live:
-            return draw(f"round IN (SELECT number FROM round WHERE closed IS NULL) AND answered < people AND {free}")
-        single = f"round IS NULL AND people = 1 AND {free}"
-        begun = f"round IS NULL AND people > 1 AND answered < people AND {free}"
-        wishes = [(single, "answered, luck"), (begun, "answered DESC, luck")]
-        for where, order in [*(reversed(wishes) if kind == "shared" else wishes), ("round IS NULL", "answered, luck")]:
-            number = draw(where, order)
-            if number is not None:
-                return number
+            if alike:
+                return random.Random(f"{seed} {assignment['place']}").choice(alike)
         return None
+
+    def _wishes(self, kind: str) -> list[tuple[str, str]]:
+        """Among which queries one is drawn, and which come first: the next wish counts if there is none of the one before."""
+        if self.live:
+            asked = "round IN (SELECT number FROM round WHERE closed IS NULL) AND answered < people"
+            return [(f"{asked} AND {_FREE}", "answered, luck")]
+        single = (f"round IS NULL AND people = 1 AND {_FREE}", "answered, luck")
+        # those that somebody has seen already first: three who have seen the same tell more than three others
+        shared = (f"round IS NULL AND people > 1 AND answered < people AND {_FREE}", "answered DESC, luck")
+        return [*([shared, single] if kind == "shared" else [single, shared]), ("round IS NULL", "answered, luck")]
 
     # --- answers ---------------------------------------------------------------------------------------------------------------
 
@@ -715,9 +708,9 @@ class Database:
 
     def late_answers(self) -> list[Said]:
         """What came when its round was closed."""
-        return [
-            Said(*row) for row in self._rows(f"SELECT {_SAID} FROM said WHERE late = 1 ORDER BY query, participant")
-        ]
+        late = "late = 1 AND kind IN ('ask', 'shared')"
+        rows = self._rows(f"SELECT {_SAID} FROM said WHERE {late} ORDER BY query, participant")
+        return list(map(_said, rows))
 
     def checks_failed(self) -> dict[int, int]:
         """In how many checks each participant who began preferred the wrong side, by number."""
@@ -960,6 +953,11 @@ class Database:
 
 
 _PARTICIPANT = "number, phase, page, consented, outcome, code"
+_UNSEEN = "NOT EXISTS (SELECT 1 FROM assignment WHERE query = query.number AND participant = :participant)"
+_FREE = (
+    "NOT EXISTS (SELECT 1 FROM assignment WHERE query = query.number AND answered = 0 AND lease > :now "
+    "AND participant != :participant)"
+)
 _SAID = "query, asked, participant, preferred, round, late, kind"
 
 

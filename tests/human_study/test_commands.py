@@ -4,6 +4,8 @@ import csv
 import json
 import re
 import sqlite3
+import subprocess
+import sys
 
 import pytest
 from study_cases import Client, answer_to, make_study, rating_of, served
@@ -41,6 +43,15 @@ def test_all_commands_are_shown(run):
     assert run()[:2] == (code, printed)
     for name in commands.ACTIONS:
         assert run(name, "--help")[0] == 0
+
+
+def test_without_the_extra_it_says_what_to_install():
+    program = (
+        "import sys; sys.modules['uvicorn'] = None; from peps_jax.human_study.__main__ import main; sys.exit(main([]))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, encoding="utf-8")
+    assert done.returncode == 2
+    assert done.stderr.endswith("error: uvicorn isn't installed: pip install 'peps-jax[study]'\n")
 
 
 @pytest.mark.slow
