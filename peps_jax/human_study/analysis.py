@@ -315,7 +315,7 @@ def figure3(folder: Folder, database: Database, found: Rated, note: str) -> Figu
 
 
 def _routes(scenes: Mapping[str, tuple[str, Segments]], params: Any, note: str) -> Figure:
-    figure, grid = panels_of(1, len(scenes), 2.6, 3.3)
+    figure, grid = panels_of(1, len(scenes), 2.6, 3.15)
     for axes, (title, (agent, rows)) in zip(grid[0], scenes.items(), strict=True):
         draw_map(axes, params)
         for place in range(min(len(rows.mask), ROUTES)):
@@ -359,7 +359,7 @@ def _colours(names: Sequence[str]) -> list[str]:
 
 def predictions_figure(rows: Sequence[Row]) -> Figure:
     """Which share of each participant's answers r-hat and their own importance ratings predict."""
-    names = {"r̂ predicts": "by r̂", "importance predicts": "by their own importance ratings"}
+    names = {"r̂ predicts": "predicted by r̂", "importance predicts": "by own importance ratings"}
     there = [name for name in names if any(name in row for row in rows)]
     figure, ((axes,),) = panels_of(1, 1, 1.0 + 1.8 * len(there), 3.4)
     tidy(axes)

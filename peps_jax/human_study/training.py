@@ -353,10 +353,14 @@ class Live:
     """
 
     def __init__(self, folder: Folder, changes: Mapping[str, Any], say: Callable[[str], None] = print):
-        self._folder, self._say, self._database = folder, say, Database(folder.database)
         settings = folder.settings()
-        agreed = _agreed(self._database.noted(NOTED), changes)
-        self.config = live_config(settings.env, **agreed)
+        self._folder, self._say, self._database = folder, say, Database(folder.database)
+        try:
+            agreed = _agreed(self._database.noted(NOTED), changes)
+            self.config = live_config(settings.env, **agreed)
+        except ValueError:
+            self._database.close()
+            raise
         self._database.note(NOTED, agreed)
         self._rates = settings.env == settings.test_env
         self._round_time = settings.round_time

@@ -8,10 +8,11 @@ import dataclasses
 import sys
 import time
 import webbrowser
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from peps_jax.command_line import Work, options, shown
+from peps_jax.command_line import Work, called, options, refuse, shown
 from peps_jax.config import Config
 from peps_jax.human_study import analysis, making, simulated_participants, tokens, training
 from peps_jax.human_study.action import Action, Errand
@@ -22,6 +23,7 @@ from peps_jax.human_study.settings import PORT, Folder
 from peps_jax.human_study.training import DiffersError, Lesson, Live
 from peps_jax.reproduce.driving import experiment
 
+PROG = called("peps_jax.human_study", "peps-study")
 OWN = ("env", "params", "belief", "method")  # what a study says itself, and what has a flag of its own
 SEEDS = 5  # agents of a method
 LABELLED = "nav-d4"
@@ -58,6 +60,22 @@ def _folder(values: argparse.Namespace) -> Folder:
     return folder
 
 
+def _in_one_line(name: str, do: Callable[[], None]) -> Callable[[], int]:
+    """`do` as a command: what it raises of bad input, or of a study that isn't what it was, is one line."""
+
+    def act() -> int:
+        try:
+            do()
+        except DiffersError as error:
+            print(error, file=sys.stderr)
+            return 1
+        except ValueError as error:
+            return refuse(f"{PROG} {name}", error)
+        return 0
+
+    return act
+
+
 # --- label ----------------------------------------------------------------------------------------------------------------
 
 
@@ -83,15 +101,20 @@ def _label(values: argparse.Namespace) -> Work:
     env = _folder(values).settings().env
     if values.env not in (None, env):
         raise ValueError(f"env {values.env!r} isn't that of the study in {values.out!r}, {env!r}: choose another --out")
-    live = Live(folder, changes)
-    serving = Serving(Study(folder), port=values.port)
+    live, study = Live(folder, changes), Study(folder)
+    try:
+        serving = Serving(study, port=values.port)
+    except ValueError:
+        live.close()
+        study.database.close()
+        raise
     token = tokens.derived(serving.study.key, "label")
     if serving.study.database.holder(tokens.digest(token)) is None:
         (number,) = serving.study.database.invite("label", [tokens.digest(token)])
         serving.study.begin(number, "label", "instructions")
     link = f"{serving.address}/#{token}"
 
-    def label() -> int:
+    def label() -> None:
         live.begin()
         with serving.in_background():
             print(f"answer here:         {link}\nwatch it learn here: {serving.researcher_link}", flush=True)
@@ -101,13 +124,12 @@ def _label(values: argparse.Namespace) -> Work:
             live.run()
             print(f"it has learned from your answers: {folder.picture}", flush=True)
             _let_them_see(serving.study.database)
-        return 0
 
     def close() -> None:
         live.close()
         serving.close()
 
-    return Errand(label, kept=KEPT, close=close)
+    return Errand(_in_one_line("label", label), kept=KEPT, close=close)
 
 
 def _let_them_see(database: Database) -> None:
@@ -146,11 +168,10 @@ def _train(values: argparse.Namespace) -> Work:
     for lesson in lessons:
         lesson.configs(folder.settings().test_env)
 
-    def train() -> int:
+    def train() -> None:
         training.teach(folder, lessons, analysis.left_out(folder, "training"), _say)
-        return 0
 
-    return Errand(train, kept="agents that are trained are kept")
+    return Errand(_in_one_line("train", train), kept="agents that are trained are kept")
 
 
 def _train_live(folder: Folder, method: list[str] | None, changes: dict[str, Any]) -> Work:
@@ -158,32 +179,26 @@ def _train_live(folder: Folder, method: list[str] | None, changes: dict[str, Any
         raise ValueError(f"method {' '.join(method)}: a training with people in the loop has one method")
     live = Live(folder, changes | ({} if method is None else {"method": method[0]}), _say)
 
-    def train() -> int:
+    def train() -> None:
         live.run()
         print(f"all rounds are answered: {folder.picture}", flush=True)
-        return 0
 
-    return Errand(train, kept=KEPT, close=live.close)
+    return Errand(_in_one_line("train", train), kept=KEPT, close=live.close)
 
 
 def _replay(values: argparse.Namespace) -> Work:
     folder = _folder(values)
 
-    def replay() -> int:
-        try:
-            lines = training.replay_lessons(folder)
-            with contextlib.closing(Database(folder.database)) as database:
-                began = bool(database.rounds())
-            if began:
-                with contextlib.closing(Live(folder, {})) as live:
-                    lines.append(live.replay())
-        except DiffersError as error:
-            print(error, file=sys.stderr)
-            return 1
+    def replay() -> None:
+        lines = training.replay_lessons(folder)
+        with contextlib.closing(Database(folder.database)) as database:
+            began = bool(database.rounds())
+        if began:
+            with contextlib.closing(Live(folder, {})) as live:
+                lines.append(live.replay())
         print("\n".join(lines) or "nothing was trained yet")
-        return 0
 
-    return Errand(replay)
+    return Errand(_in_one_line("replay", replay))
 
 
 # --- simulated participants, analysis ---------------------------------------------------------------------------------------
@@ -209,7 +224,7 @@ def _simulate(values: argparse.Namespace) -> Work:
         serving.close()
         raise ValueError(f"out {values.out!r} holds what people have said: simulate in a study of its own")
 
-    def simulate() -> int:
+    def simulate() -> None:
         database.note("simulated", True)
         changes = {} if values.total_steps is None else {"total_steps": values.total_steps}
         lessons = [Lesson(method, tuple(range(values.seeds)), 3, changes) for method in experiment.RATED]
@@ -221,9 +236,8 @@ def _simulate(values: argparse.Namespace) -> Work:
             if values.phase != "training":
                 _sit(serving, "testing", values)
                 _say(analysis.planned(folder))
-        return 0
 
-    return Errand(simulate, kept="what was answered is kept", close=serving.close)
+    return Errand(_in_one_line("simulate", simulate), kept="what was answered is kept", close=serving.close)
 
 
 def _sit(serving: Serving, phase: str, values: argparse.Namespace) -> None:
@@ -238,13 +252,12 @@ def _sit(serving: Serving, phase: str, values: argparse.Namespace) -> None:
 def _analyse(values: argparse.Namespace) -> Work:
     folder = _folder(values)
 
-    def analyse() -> int:
+    def analyse() -> None:
         written = analysis.write(folder)
         print(written[0].read_text(encoding="utf-8"))
         print(f"in {written[0].parent}: {', '.join(path.name for path in written)}")
-        return 0
 
-    return Errand(analyse)
+    return Errand(_in_one_line("analyse", analyse))
 
 
 def _say(line: str) -> None:
