@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import signal
 import sqlite3
 import subprocess
 import sys
@@ -124,6 +125,23 @@ def test_bad_flags_of_a_study_are_told_in_one_line(run, folder, arguments, compl
     assert code == 2
     assert complaint in told
     assert told.count("\n") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sign", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_server_is_stopped_in_a_line_and_begun_anew(folder, sign, code):
+    command = [sys.executable, "-m", "peps_jax.human_study", "serve", "--port", "0", "--out", str(folder.path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, encoding="utf-8") as process:
+        link = process.stdout.readline().removeprefix("researcher: ").strip()
+        address, token = link.split("/researcher#")
+        assert address.startswith("http://127.0.0.1:")
+        client = Client(address, token)
+        assert client.get("/api/researcher")["answers"] == 0
+        client.close()
+        process.send_signal(sign)
+        _, told = process.communicate(timeout=30)
+    assert process.returncode == code
+    assert told.strip() == "stopped: every answer is kept; the same command goes on"
 
 
 def test_a_port_that_is_taken_is_told(run, folder):

@@ -215,6 +215,42 @@ def test_an_order_is_laid_down_once(database):
     assert database.progress(one) == (0, 4)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_whatever_happens_every_rule_holds(tmp_path, clock, seed):
+    """People look, answer, go away and come back in any order, and the process begins anew now and then."""
+    path, chance = tmp_path / "study.sqlite", random.Random(seed)
+    database = Database.create(path, clock)
+    database.add_queries("ask", stimuli(50), [3 if place < 10 else 1 for place in range(50)])
+    checks = database.add_queries("check", stimuli(2, first=100))
+    order = lambda one: orders.of_pairs(one, 20, 0.1, 0.2, checks)
+    everybody = people(database, 6, order)
+    showing, answered = {}, Counter()
+    while sum(answered.values()) < 120:
+        one = chance.choice([one for one in everybody if answered[one] < 20])
+        now = shown(database, one)
+        assert showing.setdefault((one, now[0]), now) == now
+        assert now[0] == answered[one]
+        match chance.randrange(6):
+            case 0:
+                clock.now += chance.uniform(0, 2 * LEASE)
+            case 1:
+                database.close()
+                database = Database(path, clock)
+            case _:
+                say(database, one, chance.choice(("left", "right", "equal", "unclear")))
+                answered[one] += 1
+    for one in everybody:
+        mine = [now for (who, _), now in showing.items() if who == one]
+        places = order(one)
+        assert sum(swapped for _, _, swapped in mine) == 10
+        assert all(swapped == places[place].swapped for place, _, swapped in mine)
+        assert len({clip for _, clip, _ in mine}) == 20 - 2  # two come twice
+        assert {clip for _, clip, _ in mine if clip >= 100} == {100, 101}
+    assert not database.check_integrity()
+    assert all(database.next_shown(one, LEASE) is None for one in everybody)
+    database.close()
+
+
 # --- platforms ----------------------------------------------------------------------------------------------------------------
 
 

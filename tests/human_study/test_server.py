@@ -333,6 +333,11 @@ def test_wrong_ratings_are_refused(come, rating):
     assert client.request("POST", "/api/rating", rating_of(0) | {"frames": 0})[0] == 400
 
 
+@pytest.mark.parametrize("body", [{}, [], {"round": "0"}, {"round": -1}, {"round": None}, {"round": 0, "why": "x"}])
+def test_wrong_rounds_are_refused(researcher, body):
+    assert researcher.request("POST", "/api/researcher/close_round", body)[0] == 400
+
+
 @pytest.mark.parametrize(
     "body",
     [
