@@ -268,9 +268,10 @@ class Database:
 
     @classmethod
     def create(cls, path: Path, clock: Callable[[], float] = time.time) -> Database:
-        """A new one. Raises ValueError if there is a file already."""
+        """A new one, which only its owner may read. Raises ValueError if there is a file already."""
         if Path(path).exists():
             raise ValueError(f"database {str(path)!r} is there already")
+        Path(path).touch(mode=0o600)  # SQLite gives its log the same rights
         connection = _connect(Path(path))
         connection.executescript(f"BEGIN IMMEDIATE; {SCHEMA} PRAGMA user_version = {FORMAT}; COMMIT;")
         connection.close()

@@ -1,6 +1,6 @@
 """Which pairs people see.
 
-On the road, those of the driving study: both pieces of a pair begin at the same moment of scenes that start alike, and most
+On the dry road, those of the driving study: both pieces of a pair begin at the same moment of scenes that start alike, and most
 drivers handle the scene on purpose. Elsewhere, routes that start alike and part: what is done is held for a while, then
 something else. In navigation that is mostly one side's direction and then the other's, so that whole ways to the goal, and past
 it, are among them. Pairs that were cut anywhere from random behaviour told nothing.
@@ -54,7 +54,7 @@ def is_road(env: str) -> bool:
 def to_ask(env: str, seed: int, number: int) -> Segments:
     """`number` pairs for the training phase: numpy arrays, (number, 2, steps, ...)."""
     key_drive, key_cut = jax.random.split(jax.random.fold_in(generator.key(seed), 1))
-    if is_road(env):
+    if env == DRY:  # where the driving study's participants compare
         made = _cut_drives(_drive(key_drive, SPARE * number), key_cut)
         unfit = jnp.any(crashed(made), -1) | (_shortest(made) < comparisons.SHORTEST)
     else:
@@ -73,12 +73,12 @@ def _shortest(pairs: Segments) -> Array:
 
 
 def to_check(env: str, seed: int, number: int) -> Segments | None:
-    """`number` pairs of which the first is plainly better: on the road, braking against a collision. None elsewhere.
+    """`number` pairs of which the first is plainly better: on the dry road, braking against a collision. None elsewhere.
 
     Raises:
       ValueError: there is no collision in one of them.
     """
-    if not is_road(env) or not number:
+    if env != DRY or not number:
         return None
     key = jax.random.fold_in(generator.key(seed), 2)
     keep = lambda action: lambda observation, key, time: jnp.full(number, action)

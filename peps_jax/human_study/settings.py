@@ -20,7 +20,6 @@ from peps_jax.storage import files
 
 FILE, DATABASE, KEY, PICTURE, ROUTES = "study.toml", "study.sqlite", "key", "picture.png", "routes.json"
 PORT = 8200
-PHASES = ("training", "testing", "label")
 LONGEST = 5_000  # characters of a text
 
 

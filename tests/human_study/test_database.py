@@ -396,6 +396,12 @@ def test_it_is_synced_at_every_commit(database):
     assert value("foreign_keys") == 1
 
 
+def test_only_its_owner_may_read_it(database, tmp_path):
+    database.add_queries("ask", stimuli(2))
+    rights = {path.name: path.stat().st_mode & 0o777 for path in tmp_path.iterdir()}
+    assert rights["study.sqlite"] == rights["study.sqlite-wal"] == 0o600
+
+
 def test_a_file_that_is_no_study_is_refused(tmp_path):
     with pytest.raises(ValueError, match="isn't there"):
         Database(tmp_path / "nothing")

@@ -63,6 +63,7 @@ def test_a_check_is_braking_and_a_collision():
     assert not np.any(first)
     assert np.all(second)
     assert pairs.to_check("nav-d4", 0, 5) is None
+    assert pairs.to_check("highway-rain", 0, 5) is None
 
 
 def test_pairs_come_back_as_they_were_kept(routes):
