@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from peps_jax.human_study.database import AGREEING, Place
 
 GAP = 5  # places at least between a pair and its repeat, where there is room
+EARLY = 2 / 3  # of the order, in which pairs stand that are repeated
 
 
 def pool(participants: int, asked: int, shared: float) -> tuple[int, int]:
@@ -43,17 +44,15 @@ def of_pairs(
     once += [Place("ask", side) for side in [*swapped[len(checks) :], *both]]
     for place in chance.sample(range(len(checks), len(once)), round(asked * _share_of_places(shared))):
         once[place] = once[place]._replace(kind="shared")
-    again = range(len(once) - repeats, len(once))  # of `once`: those that are repeated
-    order = chance.sample(range(len(once)), len(once))
+    again = range(len(once) - repeats, len(once))  # of `once`: those that are repeated, none of them late
+    order = chance.sample(range(len(once) - repeats), len(once) - repeats)
     for which in again:
-        later = min(order.index(which) + 1 + GAP, len(order))
-        order.insert(chance.randint(later, len(order)), which + len(once))
-    return [
-        once[which]
-        if which < len(once)
-        else Place("repeat", not once[which - len(once)].swapped, repeats=order.index(which - len(once)))
-        for which in order
-    ]
+        order.insert(chance.randint(0, int(EARLY * len(order))), which)
+    for which in again:
+        earliest = min(order.index(which) + 1 + GAP, len(order))
+        order.insert(chance.randint(earliest, len(order)), which + len(once))
+    repeat = lambda which: Place("repeat", not once[which].swapped, repeats=order.index(which))
+    return [once[which] if which < len(once) else repeat(which - len(once)) for which in order]
 
 
 def _share_of_places(shared: float) -> float:
