@@ -411,7 +411,8 @@ class Live:
         overdue = time.time() - round.opened > self._round_time
         told = database.waits_for(round.number) if overdue else f"{round.asked} pairs are asked"
         if told != self._told:
-            self._say(f"round {round.number + 1} of {self.config.num_rounds}: {told}")
+            to_come = self.config.num_rounds - 1 - round.number
+            self._say(f"round {round.number}: {told}; {to_come} rounds are to come")
             self._told = told
         self._draw()
         time.sleep(LOOK)
@@ -425,7 +426,7 @@ class Live:
         result, index = self._undrawn
         self._undrawn = None
         answered = int(np.sum(np.asarray(result.preferences.weight) > 0))
-        show(self._folder, result, f"round {index + 1} of {self.config.num_rounds}, {answered} pairs answered")
+        show(self._folder, result, f"after {index + 1} of {self.config.num_rounds} rounds, {answered} pairs answered")
 
 
 def show(folder: Folder, result: Result, note: str) -> None:

@@ -176,9 +176,9 @@ def test_a_live_training_keeps_and_shows_what_it_learns(tmp_path, capsys):
     assert live.replay() == "all 2 rounds ask and are told what they were, and the agent is the same"
     live.close()
     assert folder.picture.read_bytes().startswith(b"\x89PNG")
-    assert "round 2 of 2" in folder.routes.read_text(encoding="utf-8")
+    assert "after 2 of 2 rounds" in folder.routes.read_text(encoding="utf-8")
     same(data.load(folder.path / "answers.npz"), data.answered(result.preferences))
-    assert "round 1 of 2: 2 pairs are asked" in capsys.readouterr().out
+    assert "round 0: 2 pairs are asked; 1 rounds are to come" in capsys.readouterr().out
     assert Database(folder.database).live == "over"
     assert list(Database(folder.database).scenes()) == ["peps"]
     with pytest.raises(ValueError, match="num_queries 6 doesn't agree with what the training was begun with, 4"):
