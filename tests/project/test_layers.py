@@ -53,6 +53,7 @@ LAYERS = (
     ("peps_jax.reproduce.summary", "peps_jax.reproduce.ways"),
     ("peps_jax.reproduce.plan", "peps_jax.reproduce.driving"),
     ("peps_jax.reproduce",),
+    ("peps_jax.human_study",),
 )
 LAYER_OF = {room: layer for layer, rooms in enumerate(LAYERS) for room in rooms}
 STRANGERS = {f"peps_jax.learning.{name}" for name in ("dynamics", "sac", "surrogate")}  # know nothing of one another

@@ -5,18 +5,22 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import peps_envs
 from peps_jax.drawing import scenes as pictures
+from peps_jax.preferences.data import Segments
 from peps_jax.reproduce.driving.experiment import SETTINGS, Conduct, Findings
 from peps_jax.reproduce.driving.ratings import RATERS, Group
 from peps_jax.reproduce.driving.scenes import BEHAVIOURS, HORIZON, RAIN, typical
 from peps_jax.reproduce.summary import TITLES
 from peps_jax.storage import files
 from peps_jax.storage.tables import markdown
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MOMENTS = (1.0, 3.0, 5.0)  # s after the start, of the paper's Figure 3
 RATE = 6  # pictures of the film for a second of the scene
@@ -97,21 +101,26 @@ def clips(shown: Mapping[str, Any], times: Sequence[float]) -> dict[str, list[pe
     return {title: pictures.scenes_of(task.environment, task.params, states, times) for title, states in shown.items()}
 
 
+def shown(scenes: Mapping[str, Segments], rated: Group) -> dict[str, Any]:
+    """States of a typical scene of each method, by its title with what raters said of it."""
+    title = lambda method: f"{TITLES[method]} (μ = {rated.mean[method]:.1f}, σ = {rated.sd[method]:.1f})"
+    return {title(method): pictures.states_of(typical(found)) for method, found in scenes.items()}
+
+
+def figure(states: Mapping[str, Any], note: str) -> Figure:
+    """The paper's Figure 3: each title's scene at `MOMENTS`, and a note below."""
+    return pictures.strips(clips(states, MOMENTS), [f"{time:g} s" for time in MOMENTS], note)
+
+
 def write(findings: Findings, folder: Path) -> list[Path]:
     """Writes figure3.png, .gif, .json and .md; returns the paths."""
     rated = (findings.wider or findings.groups)[0]
-    titles = {
-        method: f"{TITLES[method]} (μ = {rated.mean[method]:.1f}, σ = {rated.sd[method]:.1f})"
-        for method in findings.scenes
-    }
-    shown = {titles[method]: pictures.states_of(typical(scenes)) for method, scenes in findings.scenes.items()}
+    states = shown(findings.scenes, rated)
     files.make_folder(folder)
-    note = f"ratings by simulated participants; one-way ANOVA: p = {rated.p:.2g}"
-    labels = [f"{time:g} s" for time in MOMENTS]
-    strips = pictures.strips(clips(shown, MOMENTS), labels, note)
+    strips = figure(states, f"ratings by simulated participants; one-way ANOVA: p = {rated.p:.2g}")
     files.write_with(folder / PICTURE, lambda path: strips.savefig(path, dpi=150))
     times = np.arange(0, HORIZON + 0.5, 1 / RATE)
-    files.write_with(folder / FILM, lambda path: pictures.film(clips(shown, times), path, RATE))
+    files.write_with(folder / FILM, lambda path: pictures.film(clips(states, times), path, RATE))
     numbers = json.dumps(summary(findings), indent=1, allow_nan=False) + "\n"
     files.write_whole(folder / NUMBERS, numbers.encode())
     files.write_whole(folder / TABLE, text(findings).encode())
