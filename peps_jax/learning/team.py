@@ -24,8 +24,8 @@ from peps_jax.learning.sac import Agent, Noise
 from peps_jax.settings import AgentSettings
 from peps_jax.trajectory import Transition
 
-# candidates of each policy, and of the uniform one: few at every sample of a minibatch, more where they act
-TO_LEARN, TO_ACT = 3, 16
+# candidates of each policy, and of the uniform one: to learn, the better of what they do; a few more where they act
+TO_LEARN, TO_ACT = 1, 4
 
 
 class Candidates(NamedTuple):
