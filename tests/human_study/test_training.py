@@ -1,5 +1,7 @@
 """Trainings by what people say: rounds that wait, come back and replay; a training from all that was said before."""
 
+import json
+
 import jax
 import numpy as np
 import pytest
@@ -217,3 +219,24 @@ def test_answers_through_the_database_teach_what_a_recorded_file_does(config, tm
     found, other = (training.learn(configs, one, scenes=2) for one in (kept, again))
     assert found.digest == other.digest
     assert found.scenes.mask.shape == (2, 2, Navigation.horizon)
+
+
+@pytest.mark.parametrize(
+    ("now", "what"),
+    [
+        ([[1, 1, 1.0]], "participant 2's answer to query 1 is missing"),
+        ([[1, 1, 1.0], [1, 2, 0.5], [2, 1, None]], "participant 1's answer to query 2 is new"),
+        ([[1, 1, 1.0], [1, 2, None]], "participant 2's answer to query 1 has changed"),
+    ],
+)
+def test_one_line_says_which_answer_differs(now, what):
+    before = [[1, 1, 1.0], [1, 2, 0.5]]
+    training._check_told(before, before)
+    with pytest.raises(training.DiffersError, match=f"^{what} since the agents were trained$"):
+        training._check_told(before, now)
+
+
+def test_a_lesson_is_read_back_from_what_is_noted():
+    lesson = training.Lesson("peps", (0, 3), 2, {"hidden_sizes": (8, 8), "lam": 2.0})
+    assert training.Lesson.read(json.loads(json.dumps(lesson.said()))) == lesson
+    assert [config.seed for config in lesson.configs(ENV)] == [0, 3]

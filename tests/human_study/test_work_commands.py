@@ -5,6 +5,7 @@ import json
 import os
 import re
 import signal
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -149,6 +150,28 @@ def test_one_person_teaches_an_agent_and_replays_it(tmp_path, capsys, monkeypatc
     code, _, told = run(capsys, "label", "--num-queries", 6, "--port", 0, "--out", tmp_path)
     assert code == 2
     assert "num_queries 6 doesn't agree" in told
+
+
+@pytest.mark.slow
+def test_a_dry_run_of_a_whole_study(tmp_path, capsys):
+    out = tmp_path / "study"
+    numbers = "--participants 2 --pairs 10 --repeats 0.2 --shared 0.5".split()
+    assert run(capsys, "make", "--env", ENV, *numbers, "--out", out)[0] == 0
+    code, _, told = run(capsys, "simulate", 2, "--seeds", 1, "--total-steps", 800, "--out", out)
+    assert code == 0, told
+    assert told.count("agents learned") == 3
+    assert "raters find a difference" in told
+    code, printed, told = run(capsys, "replay", "--out", out)
+    assert code == 0, told
+    assert printed.count("answers and 1 agents are what they were") == 3
+    code, printed, _ = run(capsys, "analyse", "--out", out)
+    assert code == 0
+    assert "repeated-measures ANOVA (main)" in printed
+    with contextlib.closing(sqlite3.connect(out / "study.sqlite")) as connection, connection:
+        connection.execute("DELETE FROM answer WHERE assignment = 1")
+    code, _, told = run(capsys, "replay", "--out", out)
+    assert code == 1
+    assert re.fullmatch(r"participant 1's answer to query \d+ is missing since the agents were trained\n", told)
 
 
 @contextlib.contextmanager

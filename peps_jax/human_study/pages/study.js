@@ -19,14 +19,11 @@ let player = null; // of what is on the screen
 let press = () => false; // what a key does here, true if anything
 let notice = ""; // what is said beside the next thing that is shown
 let waits = 0; // how often somebody who waits has asked
-let visit = 0; // counts what was shown: what was begun before is over
+let visit = 0; // counts where one has been: what was begun before is over
 
 // --- what is sent -----------------------------------------------------------------------------------------------------------
 
-let troubled = 0;
-
 function trouble(is, text) {
-  troubled += is ? 1 : -1;
   if (is) $("trouble").textContent = text;
   $("trouble").hidden = !is;
 }
@@ -80,6 +77,7 @@ async function guarded(action) {
     if (error.status === 409) {
       // said in another tab, or before a reload: go on from where the server is
       notice = "That one was answered already. ";
+      await pause(WAITS[0]);
       await guarded(async () => go(await ask("/api/state")));
     } else if (error.status === 429) {
       refuse("Too many attempts with links that don’t work. Please try again in a few minutes.", error.message);
@@ -102,6 +100,7 @@ const PAGES = { consent, check, instructions, importance, pairs, ratings, wait, 
 
 /** Shows where `state` says that the participant is; what is done there begins a chain of its own. */
 function go(state) {
+  visit += 1;
   $("title").textContent = state.title;
   document.title = state.title;
   guarded(() => PAGES[state.page](state));
@@ -149,13 +148,15 @@ function enable(buttons, can) {
 
 const can = (button) => button.getAttribute("aria-disabled") !== "true";
 
-/** Lets `button` do `action` once: further clicks until it has ended do nothing. */
+/** Lets `button` do `action` once; again only if that led nowhere. */
 function onClick(button, action) {
+  enable([button], true);
   button.onclick = async () => {
     if (!can(button)) return;
+    const there = still();
     enable([button], false);
     await guarded(action);
-    enable([button], true);
+    if (there()) enable([button], true);
   };
 }
 
@@ -281,8 +282,9 @@ function instructions(state) {
   const rates = state.phase === "testing";
   $("keys-pairs").hidden = rates;
   $("keys-ratings").hidden = !rates;
-  $("instructions-on").textContent = rates ? "Continue" : "Try two for practice";
-  onClick($("instructions-on"), () => (rates ? ready(state) : practise(state)));
+  const practises = state.phase === "training";
+  $("instructions-on").textContent = practises ? "Try two for practice" : "Continue";
+  onClick($("instructions-on"), () => (practises ? practise(state) : ready(state)));
 }
 
 async function practise(state) {
@@ -362,7 +364,7 @@ async function ratings() {
   if (await over(scene)) return;
   const said = await rated(scene);
   const { frames, ...report } = said.report;
-  const reply = await send("/api/rating", { place: scene.place, rating: said.choice, frames: frames.clip, ...report });
+  const reply = await send("/api/rating", { place: scene.place, rating: Number(said.choice), frames: frames.clip, ...report });
   go(reply.state);
 }
 
@@ -418,59 +420,46 @@ function rated(scene) {
 
 const CANVAS = { left: "left-clip", right: "right-clip", clip: "scene-clip" };
 
-function chosen({ page, what, named, buttons, choiceOf, bar, replay, place, total, practice }) {
-  const there = turnTo(page);
-  waits = 0;
+/** Shows clips until somebody has chosen one of `buttons`. */
+function chosen(asked) {
+  const there = turnTo(asked.page);
+  const { buttons, choiceOf, replay } = asked;
+  const { stages, every, announce, watch } = layOut(asked);
+  const names = Object.keys(asked.named);
   const request = identity();
-  const names = Object.keys(named);
-  const every = Object.values(buttons);
-  const section = document.querySelector(`section[data-page="${page}"]`);
-  const both = names.length > 1;
-  progress(place, total, `${practice ? "Practice" : what} ${place + 1} of ${total}`);
-  $("practice-mark").hidden = !practice;
-  for (const button of every) button.classList.remove("chosen");
-  enable(every, false);
-  enable([replay], true);
-  const hint = section.querySelector(".hint");
-  const announce = (text) => (hint.textContent = text);
-  announce(`${notice}Watch ${both ? "both clips to their end" : "the clip to its end"}.`);
+  announce(`${notice}Watch ${watch}.`);
   notice = "";
-  section.classList.toggle("wide", view.width > WIDE * view.height);
-  const stages = names.map((name) => {
-    const canvas = $(CANVAS[name]);
-    canvas.setAttribute("aria-label", both ? `The ${name} clip` : "The clip");
-    return { canvas, box: canvas.parentElement };
-  });
+  waits = 0;
   return new Promise((resolve) => {
-    const mine = new Player(stages, view, Object.values(named), {
+    const mine = new Player(stages, view, Object.values(asked.named), {
       onSeen: () => {
         enable(every, true);
         announce("Now choose. You may watch again as often as you like.");
       },
-      onTime: (share) => (bar.style.transform = `scaleX(${share})`),
+      onTime: (share) => (asked.bar.style.transform = `scaleX(${share})`),
     });
     player = mine;
     let said = false;
     const choose = async (choice) => {
       if (said || !there()) return;
       if (!mine.seen) {
-        announce(`First watch ${both ? "both clips to their end" : "the clip to its end"}.`);
+        announce(`First watch ${watch}.`);
         return;
       }
       said = true;
-      const frames = Object.fromEntries(names.map((name, number) => [name, mine.frames[number]]));
+      const frames = Object.fromEntries(names.map((name, place) => [name, mine.frames[place]]));
       const report = { ...mine.report(), frames, request };
       enable([...every, replay], false);
       buttons[choice].classList.add("chosen");
       announce("");
       await pause(FLASH);
       mine.stop();
-      resolve({ choice: both ? choice : Number(choice), report });
+      resolve({ choice, report });
     };
     const again = () => {
       if (!said && there()) mine.replay();
     };
-    for (const [choice, button] of Object.entries(buttons)) button.onclick = () => choose(choice);
+    for (const choice of Object.keys(buttons)) buttons[choice].onclick = () => choose(choice);
     replay.onclick = again;
     press = (key) => {
       if (key === "r" || key === "R") again();
@@ -480,6 +469,28 @@ function chosen({ page, what, named, buttons, choiceOf, bar, replay, place, tota
     };
     mine.start();
   });
+}
+
+/** The page as it is before anything has been seen. */
+function layOut({ page, what, named, buttons, replay, place, total, practice }) {
+  const section = document.querySelector(`section[data-page="${page}"]`);
+  const hint = section.querySelector(".hint");
+  const every = Object.values(buttons);
+  const names = Object.keys(named);
+  const both = names.length > 1;
+  section.classList.toggle("wide", view.width > WIDE * view.height);
+  progress(place, total, `${practice ? "Practice" : what} ${place + 1} of ${total}`);
+  $("practice-mark").hidden = !practice;
+  for (const button of every) button.classList.remove("chosen");
+  enable(every, false);
+  enable([replay], true);
+  const stages = names.map((name) => {
+    const canvas = $(CANVAS[name]);
+    canvas.setAttribute("aria-label", both ? `The ${name} clip` : "The clip");
+    return { canvas, box: canvas.parentElement };
+  });
+  const announce = (text) => (hint.textContent = text);
+  return { stages, every, announce, watch: both ? "both clips to their end" : "the clip to its end" };
 }
 
 // --- wait, done -------------------------------------------------------------------------------------------------------------

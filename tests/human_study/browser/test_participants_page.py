@@ -31,19 +31,10 @@ def answered(page, number):
     page.wait_for_selector(f"#progress-text:visible:has-text('{number + 1} of'), [data-page=done]:not([hidden])")
 
 
-def by_key(page, choice):
-    page.keyboard.press(KEYS[choice])
-
-
-def by_button(page, choice):
-    page.click(f"#{choice}")
-
-
-@pytest.mark.parametrize("by", ["keys", "buttons"])
-def test_the_training_phase_from_start_to_end(page, fake, by):
+def test_the_training_phase_from_start_to_end(page, fake):
     fake.state["page"] = "consent"
     fake.open(page)
-    click, answer = clicking(page, by), by_key if by == "keys" else by_button
+    click = clicking(page, "keys")
     click("#agree")
     page.wait_for_selector("#check-on[aria-disabled=false]")
     click("#check-on")
@@ -51,21 +42,18 @@ def test_the_training_phase_from_start_to_end(page, fake, by):
     for place in (1, 2):
         expect(page.locator("#practice-mark")).to_be_visible()
         seen(page)
-        answer(page, "left")
+        page.keyboard.press(KEYS["left"])
         page.wait_for_selector(f"#progress-text:visible:has-text('{place + 1} of'), #begin:visible")
     click("#begin")
     shown(page, "importance")
-    if by == "keys":
-        page.keyboard.type("25")
-    else:
-        for item, value in (("item-0", 2), ("item-1", 5)):
-            page.check(f"input[name={item}][value='{value}']", force=True)
+    page.keyboard.type("2")
+    page.check("input[name=item-1][value='5']", force=True)
     click("#importance-on")
     for place, choice in enumerate(("right", "equal", "unclear"), 1):
         shown(page, "pairs")
         expect(page.locator("#practice-mark")).to_be_hidden()
         seen(page)
-        answer(page, choice)
+        page.keyboard.press(KEYS[choice])
         answered(page, place)
     expect(page.locator("#code")).to_have_text("C1A2B3C4")
     (check,) = [body for body in fake.posted("/api/proceed") if body["page"] == "check"]
@@ -77,8 +65,7 @@ def test_the_training_phase_from_start_to_end(page, fake, by):
     assert page.context.cookies() == []
 
 
-@pytest.mark.parametrize("by", ["keys", "buttons"])
-def test_ratings_from_start_to_end(page, by):
+def test_ratings_from_start_to_end(page):
     fake = Fake(page="instructions", phase="testing")
     fake.open(page)
     page.click("#instructions-on")
@@ -86,10 +73,7 @@ def test_ratings_from_start_to_end(page, by):
     for place, rating in enumerate((1, 7, 10), 1):
         shown(page, "ratings")
         seen(page)
-        if by == "keys":
-            page.keyboard.press(str(rating % 10))
-        else:
-            page.get_by_role("button", name=str(rating)).filter(has_text=re.compile(f"^{rating}$")).click()
+        page.get_by_role("button", name=str(rating)).filter(has_text=re.compile(f"^{rating}$")).click()
         answered(page, place)
     told = fake.posted("/api/rating")
     assert [body["rating"] for body in told] == [1, 7, 10]
@@ -140,6 +124,17 @@ def test_many_clicks_store_one_answer(page, fake, clicks):
         (1, "right"),
         (2, "equal"),
     ]
+
+
+def test_a_double_click_goes_one_page_on(page, fake):
+    fake.state["page"] = "importance"
+    fake.open(page)
+    shown(page, "importance")
+    page.keyboard.type("25")
+    page.locator("#importance-on").click(click_count=5)
+    seen(page)
+    assert len(fake.posted("/api/importance")) == 1
+    assert len([path for _, path, _ in fake.requests if path == "/api/pair"]) == 1
 
 
 def test_a_held_key_answers_one_pair(page, fake):
@@ -207,6 +202,7 @@ def test_two_tabs_ask_nothing_twice(context, page, fake, complaints):
         seen(tab)
     page.keyboard.press("ArrowLeft")
     answered(page, 1)
+    fake.steps = 60  # for the notice to be there long enough
     other.keyboard.press("ArrowRight")  # refused: it was answered in the first tab
 
     assert fake.answers[0]["choice"] == "left"
