@@ -217,7 +217,7 @@ CONSENT = (
     "REPLACE THIS: who runs the study, whom to write to, what is paid, and which committee has approved it.",
 )
 DRIVING = (
-    "You will see pairs of short scenes on a road with three lanes, seen from above. Watch the marked car, and what it does "
+    "You will see pairs of short scenes on a road with two lanes, seen from above. Watch the marked car, and what it does "
     "when the car in front of it brakes.",
     "Say in which of the two scenes the marked car drives more as you would expect of a good driver.",
 )
