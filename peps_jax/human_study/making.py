@@ -28,7 +28,14 @@ def check(folder: Folder, env: str, test_env: str, numbers: dict[str, Any]) -> S
 
 
 def _content(env: str, test_env: str, numbers: dict[str, Any]) -> str:
-    return settings.template(env, test_env, pairs.is_road(env) and pairs.is_road(test_env), **numbers)
+    roads = pairs.is_road(env) and pairs.is_road(test_env)
+    return settings.template(env, test_env, roads, _roles(pairs.problem(env)), **numbers)
+
+
+def _roles(task: Problem) -> list[str]:
+    """Of what there is to see in an environment."""
+    state, _ = task.environment.reset(jax.random.key(0), task.params)
+    return sorted({shape.colour for shape in task.environment.scene(jax.device_get(state), task.params).shapes})
 
 
 def make(folder: Folder, env: str, test_env: str, numbers: dict[str, Any], with_pairs: bool = True) -> Settings:

@@ -13,6 +13,7 @@ import dataclasses
 import json
 import math
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -217,14 +218,22 @@ CONSENT = (
     "REPLACE THIS: who runs the study, whom to write to, what is paid, and which committee has approved it.",
 )
 DRIVING = (
-    "You will see pairs of short scenes on a road with two lanes, seen from above. Watch the marked car, and what it does "
+    "You will see pairs of short scenes on a road with two lanes, seen from above. Watch the green car, and what it does "
     "when the car in front of it brakes.",
-    "Say in which of the two scenes the marked car drives more as you would expect of a good driver.",
+    "Say in which of the two scenes the green car drives more as you would expect of a good driver.",
 )
 ANYTHING = (
     "You will see pairs of short clips side by side. Something moves in each of them.",
     "Say in which of the two it does what you would rather expect of it.",
 )
+GROUND = {
+    "goal": "green is where it should go",
+    "ice": "blue is ice",
+    "sand": "pale yellow is deep sand",
+    "firm sand": "yellow is sand",
+    "pit": "brown is a pit",
+    "wall": "grey are walls",
+}  # by the roles of what a scene shows
 ANSWERING = (
     "Use the buttons or the keys: left or right for the side that you prefer, down if both are equal, up if you can't tell. "
     "You can answer once both clips have been shown, and may watch them again.",
@@ -242,19 +251,24 @@ DRIVING_IMPORTANCE = (
 )
 
 
-def template(env: str, test_env: str, driving: bool, **numbers: Any) -> str:
+def template(env: str, test_env: str, driving: bool, ground: Sequence[str] = (), **numbers: Any) -> str:
     """The file of a new study, with a comment at everything that can be changed.
 
     Args:
       env: whose pairs are compared in the training phase.
       test_env: whose scenes are rated in the testing phase.
       driving: whether both are roads.
+      ground: roles of what there is to see in `env`; those that `GROUND` knows are explained.
       numbers: settings that aren't the defaults.
     """
     values = {field.name: numbers.get(field.name, field.default) for field in NUMBERS}
     if not driving and "checks" not in numbers:
         values["checks"] = 0
     about = DRIVING if driving else ANYTHING
+    explained = [text for role, text in GROUND.items() if role in ground]
+    if explained:
+        legend = ", ".join(explained)
+        about += (f"{legend[0].upper()}{legend[1:]}.",)
     texts = {
         "consent": CONSENT,
         "instructions_training": about + ANSWERING,

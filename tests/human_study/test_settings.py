@@ -19,7 +19,8 @@ def test_a_new_file_says_what_it_was_made_of():
 
 
 def test_elsewhere_there_are_neither_collisions_nor_the_papers_four():
-    made = settings.read(settings.template("nav-d4", "nav-d4", False))
+    made = settings.read(settings.template("nav-d4", "nav-d4", False, ("agent", "firm sand", "goal", "ice")))
+    assert "Green is where it should go, blue is ice, yellow is sand." in made.texts.instructions_training
     assert made.checks == 0
     assert made.importance == ()
 
