@@ -6,7 +6,7 @@ READY := .venv/ready
 ARGS ?=
 REPRODUCED ?= results/reproduce
 
-.PHONY: sweep reproduce test docs film benchmark readme publish lint lock setup
+.PHONY: sweep reproduce label test test-long docs film benchmark readme publish lint lock setup
 .DEFAULT_GOAL := sweep
 
 sweep: $(READY)
@@ -16,8 +16,16 @@ sweep: $(READY)
 reproduce: $(READY)
 	$(BIN)/python -m peps_jax.reproduce $(ARGS)
 
+# one person teaches an agent in the browser
+label: $(READY)
+	$(BIN)/python -m peps_jax.human_study label $(ARGS)
+
 test: $(READY)
 	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal --durations 10 $(ARGS)
+
+# those that take a minute or more each
+test-long: $(READY)
+	$(BIN)/python -m pytest -m long -n logical --maxprocesses 4 --dist worksteal --durations 10 $(ARGS)
 
 # the pages under docs/ and the API's reference as a site in site/; a warning is an error
 docs: $(READY)

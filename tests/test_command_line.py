@@ -44,6 +44,9 @@ ASCII = {
 }  # nothing but ASCII, in files' names and in print
 
 
+PROCESSES = ("run", "Popen", "call", "check_call", "check_output")
+
+
 def text_without_encoding(path: Path) -> list[str]:
     """One line for each call in a source that reads or writes text as the locale would have it."""
     lines = []
@@ -63,7 +66,7 @@ def text_without_encoding(path: Path) -> list[str]:
                 and "b" not in "".join(modes or [default])
             )
             or (name == "open" and modes and "b" not in "".join(modes))
-            or bool({"text", "universal_newlines"} & given.keys())
+            or (name in PROCESSES and bool({"text", "universal_newlines"} & given.keys()))
         )
         if text and not {"encoding", None} & given.keys():  # None: **options
             lines.append(f"{path}:{node.lineno} {name} without an encoding")

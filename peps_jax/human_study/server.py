@@ -267,7 +267,9 @@ class Study:
         picture = self.folder.picture
         version = picture.stat().st_mtime_ns if picture.is_file() else None
         found["picture"] = None if version is None else f"/api/researcher/picture?v={version}"
-        found["routes"] = json.loads(self.folder.routes.read_text()) if self.folder.routes.is_file() else None
+        found["routes"] = (
+            json.loads(self.folder.routes.read_text(encoding="utf-8")) if self.folder.routes.is_file() else None
+        )
         return found | {
             "title": self.settings.title,
             "live": self.database.live,

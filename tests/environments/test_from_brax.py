@@ -49,7 +49,7 @@ def _lenient():
         yield
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("make", [reacher, hopper])
 def test_random_steps_are_braxs_bit_by_bit(make):
     """20 000, of 100 walks at once."""
@@ -86,15 +86,15 @@ def test_a_beliefs_step_knows_nothing_of_the_true_system(backend):
     heavy = env.sys.tree_replace(
         {"link.inertia.mass": 3 * env.sys.link.inertia.mass, "body_mass": 3 * env.sys.body_mass}
     )
-    made = {}
+    key, push, moved = jax.random.key(0), jnp.ones(2), {}
     for name, system in (("true", env.sys), ("heavy", heavy)):
-        state, _ = jax.jit(environment.reset)(jax.random.key(0), system)
-        made[name] = environment.adopted(state, heavy).inner.pipeline_state
-        unadopted = state.inner.pipeline_state
+        state, _ = jax.jit(environment.reset)(key, system)
+        adopted = environment.adopted(state, heavy)
         if name == "true" and backend != "mjx":
-            assert not np.array_equal(mass_of(unadopted), mass_of(made["true"]))
-    for one, other in zip(jax.tree.leaves(made["true"]), jax.tree.leaves(made["heavy"]), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=5e-5)
+            assert not np.array_equal(mass_of(state.inner.pipeline_state), mass_of(adopted.inner.pipeline_state))
+        after = jax.jit(environment.step)(key, adopted, push, heavy).state.inner.pipeline_state
+        moved[name] = after.q, after.qd
+    jax.tree.map(lambda one, other: np.testing.assert_allclose(one, other, rtol=1e-4, atol=5e-5), *moved.values())
 
 
 def mass_of(state):
@@ -117,7 +117,7 @@ def test_the_truth_surprises_nobody_who_knows_it():
     assert surprise(weak) < -0.005
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("make", [reacher, hopper])
 def test_a_training_with_a_belief(make, train):
     environment, belief = make()

@@ -183,7 +183,7 @@ def test_a_belief_expects_what_the_other_model_does():
     assert believes.min() < -0.01
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_training_with_a_belief(train):
     environment = push()
     heavy, light = (environment.model(compiled(mass)) for mass in (5.0, 1.0))

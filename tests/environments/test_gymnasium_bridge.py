@@ -96,8 +96,8 @@ def test_a_task_that_is_registered_later_gets_an_id(monkeypatch):
     [
         ("nav-d3", 1_000),
         ("highway-rain", 300),
-        pytest.param("nav-d3", 20_000, marks=pytest.mark.slow),
-        pytest.param("highway-rain", 20_000, marks=pytest.mark.slow),
+        pytest.param("nav-d3", 20_000, marks=pytest.mark.long),
+        pytest.param("highway-rain", 20_000, marks=pytest.mark.long),
     ],
 )
 def test_random_steps_are_the_environments_bit_by_bit(name, steps):
@@ -220,7 +220,7 @@ def test_an_agent_of_ours_acts_in_gymnasium(tiny):
     np.testing.assert_allclose(total, evaluate(result, 1).return_[0], rtol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_sac_of_stable_baselines3_learns_d1():
     sb3 = pytest.importorskip("stable_baselines3")
     torch = pytest.importorskip("torch")

@@ -201,7 +201,7 @@ def test_an_export_holds_no_personal_data(run, finished):
     codes = [row["code"] for row in rows]
     code, _, _ = run("export", "--out", finished.path)
     assert code == 0
-    exported = {path.name: path.read_text() for path in (finished.path / "export").iterdir()}
+    exported = {path.name: path.read_text(encoding="utf-8") for path in (finished.path / "export").iterdir()}
     names = {"participants", "queries", "scenes", "answers", "ratings", "importance", "rounds"}
     assert set(exported) == {f"{name}.csv" for name in names} | {"study.json"}
     key = tokens.read_key(finished.key)

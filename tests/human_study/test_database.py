@@ -405,7 +405,7 @@ def test_only_its_owner_may_read_it(database, tmp_path):
 def test_a_file_that_is_no_study_is_refused(tmp_path):
     with pytest.raises(ValueError, match="isn't there"):
         Database(tmp_path / "nothing")
-    (tmp_path / "text").write_text("no database, and long enough to be read as one" * 50)
+    (tmp_path / "text").write_text("no database, and long enough to be read as one" * 50, encoding="utf-8")
     with pytest.raises(ValueError, match="can't be read"):
         Database(tmp_path / "text")
     sqlite3.connect(tmp_path / "other").close()

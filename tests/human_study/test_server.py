@@ -165,7 +165,7 @@ def test_importance_may_be_taken_out_meanwhile(tmp_path):
         client.post("/api/consent", {"agreed": True, "platform": {}})
         client.post("/api/proceed", {"page": "check"})
         assert client.post("/api/proceed", {"page": "instructions"})["page"] == "importance"
-    folder.file.write_text(folder.file.read_text().split("[[importance]]")[0])
+    folder.file.write_text(folder.file.read_text(encoding="utf-8").split("[[importance]]")[0], encoding="utf-8")
     with served(folder) as serving:
         client = Client(serving.address, token)
         assert client.post("/api/proceed", {"page": "instructions"})["page"] == "pairs"
@@ -619,6 +619,8 @@ def test_a_round_is_closed_by_hand(tmp_path):
 
 def test_a_study_whose_environment_was_changed_is_refused(tmp_path):
     folder = make_study(tmp_path / "changed")
-    folder.file.write_text(folder.file.read_text().replace('env = "highway-dry"', 'env = "nav-d4"', 1))
+    folder.file.write_text(
+        folder.file.read_text(encoding="utf-8").replace('env = "highway-dry"', 'env = "nav-d4"', 1), encoding="utf-8"
+    )
     with pytest.raises(ValueError, match="env 'nav-d4' can't be changed: the study was made with 'highway-dry'"):
         Study(folder)

@@ -69,6 +69,6 @@ def test_every_number_of_the_file_has_a_comment():
 def test_a_folder_without_a_study_is_refused(tmp_path):
     with pytest.raises(ValueError, match="holds no study: make one first"):
         Folder(tmp_path).check()
-    (tmp_path / settings.FILE).write_text("x")
+    (tmp_path / settings.FILE).write_text("x", encoding="utf-8")
     with pytest.raises(ValueError, match="holds a study already"):
         Folder(tmp_path).check_free()

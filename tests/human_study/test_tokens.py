@@ -35,7 +35,7 @@ def test_only_the_owner_may_read_the_key(tmp_path):
 
 @pytest.mark.parametrize("content", ["", "abc", "zz" * 32, "ab" * 31])
 def test_a_damaged_key_is_refused(tmp_path, content):
-    (tmp_path / "key").write_text(content)
+    (tmp_path / "key").write_text(content, encoding="utf-8")
     with pytest.raises(ValueError, match=r"key .* is damaged: it has to hold 64 hexadecimal digits"):
         tokens.read_key(tmp_path / "key")
 

@@ -152,7 +152,7 @@ def test_one_person_teaches_an_agent_and_replays_it(tmp_path, capsys, monkeypatc
     assert "num_queries 6 doesn't agree" in told
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_dry_run_of_a_whole_study(tmp_path, capsys):
     out = tmp_path / "study"
     numbers = "--participants 2 --pairs 10 --repeats 0.2 --shared 0.5".split()
@@ -186,7 +186,7 @@ def labelling(out):
             process.kill()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_agent_takes_the_sand_after_a_hundred_answers_though_its_person_goes_and_comes_back(tmp_path):
     with labelling(tmp_path) as (process, link):
         for answers in (10, 11):  # the page is closed and opened again

@@ -77,7 +77,7 @@ def test_answers_follow_eq_2(line, rationality, mistake_rate):
 
 @pytest.mark.parametrize("informed", [0.0, 0.3, 1.0])
 def test_a_share_of_the_answers_is_by_somebody_who_knows_the_truth(line, informed):
-    config = line.replace(informed=informed, belief=LineParams(noise=0.1, slope=-2.0))
+    config = line.replace(informed=informed, belief=LineParams(noise=0.1, slope=10.0))
     segments = query([0.0, 0.1], [0.2, 0.1])
     of = lambda belief: 1 / (1 + np.exp(-float(np.subtract(*values_of(segments, config.replace(belief=belief))[0]))))
     probability = informed * of(line.params) + (1 - informed) * of(config.belief)

@@ -9,7 +9,7 @@ from test_readme import ROOT, shortened, text_of
 
 BLOCKS = re.findall(r"```python\n(.*?)```", text_of(ROOT / "docs" / "bridges.md"), flags=re.DOTALL)
 OURS = ("peps_envs", "peps_jax")
-SLOW = ("train(", "SAC(")
+LONG = ("train(", "SAC(")
 
 
 def ecosystems(block: str) -> set[str]:
@@ -25,7 +25,7 @@ def name_of(block: str) -> str:
 @pytest.mark.filterwarnings("ignore:Brax System:UserWarning", "ignore:Accessing `:DeprecationWarning")
 @pytest.mark.parametrize(
     "block",
-    [pytest.param(block, marks=pytest.mark.slow if any(word in block for word in SLOW) else ()) for block in BLOCKS],
+    [pytest.param(block, marks=pytest.mark.long if any(word in block for word in LONG) else ()) for block in BLOCKS],
     ids=map(name_of, BLOCKS),
 )
 def test_an_example_runs(block, tmp_path, monkeypatch):
