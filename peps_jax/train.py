@@ -7,11 +7,12 @@ a person in between (a host teacher), and gets the same numbers as the scan.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
 
@@ -245,7 +246,7 @@ def train(config: Config, teacher: Teacher = SYNTHETIC) -> Result:
     teacher.check(training.method.asks, training.settings)
     state = init(training, teacher)
     if teacher.host is not None:
-        return finish(*_run_with_host(state, training, teacher.host), training)
+        return finish(*run_with_host(state, training, teacher.host), training)
     indices = jnp.arange(training.settings.schedule.num_rounds, dtype=jnp.int32)
     return finish(*_run_rounds(state, indices, training), training)
 
@@ -257,16 +258,19 @@ def finish(state: TrainingState, curves: dict[str, Array], training: Training) -
 
 # compiled once for every structure, whoever teaches, where the caller doesn't compile: so a recording has its teacher's bits
 _run_rounds = jax.jit(run_rounds)
-_halves = jax.jit(collect_and_ask), jax.jit(hear), jax.jit(learn_and_improve)
+halves = jax.jit(collect_and_ask), jax.jit(hear), jax.jit(learn_and_improve)
 
 
-def _run_with_host(
-    state: TrainingState, training: Training, host: Callable[[Queries, int], Answers | None]
+def run_with_host(
+    state: TrainingState,
+    training: Training,
+    host: Callable[[Queries, int], Answers | None],
+    after: Callable[[Result, int], None] | None = None,
 ) -> tuple[TrainingState, dict[str, Array]]:
-    """All rounds, with `host` called between the halves of each."""
+    """All rounds, with `host` called between the halves of each, and `after` at its end with what was learned so far."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((state, training))):
         raise ValueError("teacher is outside the program: train can't be inside jax.jit, jax.vmap or a scan then")
-    first_half, file, second_half = _halves
+    first_half, file, second_half = halves
     rows = []
     for index in range(training.settings.schedule.num_rounds):
         now = round_at(jnp.asarray(index, jnp.int32), state.key, training.settings.schedule)
@@ -277,4 +281,10 @@ def _run_with_host(
             state = file(state, answers, now)
         state, learned = second_half(state, now, training)
         rows.append(jax.device_get(collected | learned))
-    return state, jax.tree.map(lambda *values: jnp.stack(values), *rows)
+        if after is not None:
+            after(finish(state, _curves(rows), training), index)
+    return state, jax.tree.map(jnp.asarray, _curves(rows))
+
+
+def _curves(rows: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    return jax.tree.map(lambda *values: np.stack(values), *rows)

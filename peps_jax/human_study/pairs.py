@@ -27,7 +27,7 @@ from peps_jax.human_study import clips
 from peps_jax.human_study.database import Stimulus
 from peps_jax.preferences.data import Segments
 from peps_jax.reproduce.driving import comparisons
-from peps_jax.reproduce.driving.scenes import DRY, RAIN, crashed, road, watch
+from peps_jax.reproduce.driving.scenes import DRY, RAIN, crashed, road, watch, whole
 from peps_jax.settings import RolloutSettings
 from peps_jax.storage import files
 
@@ -105,17 +105,7 @@ def routes(key: Array, task: Problem, number: int) -> tuple[Segments, Array]:
     act = lambda observation, key, time: plan[:, time]
     starts = twice(rollout.init(key_start, task, settings(number)))
     collect = jax.jit(lambda starts: rollout.collect(starts, act, key_steps, task, settings(2 * number))[1])
-    rows = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), collect(starts))
-    over = rows.transition.terminated | rows.truncated
-    whole = Segments(
-        observation=rows.transition.observation,
-        action=rows.transition.action,
-        mask=jnp.cumsum(over, 1) - over == 0,
-        reward=rows.transition.reward,
-        state=rows.state,
-        next_state=rows.next_state,
-    )
-    return jax.tree.map(lambda rows: rows.reshape(number, 2, *rows.shape[1:]), whole), part
+    return jax.tree.map(lambda rows: rows.reshape(number, 2, *rows.shape[1:]), whole(collect(starts))), part
 
 
 def held(key: Array, environment: Environment, number: int, length: int) -> Array:
@@ -138,16 +128,16 @@ def _beside(rows: Array, other: Array) -> Array:
     return rows.reshape(*rows.shape, *[1] * (other.ndim - rows.ndim))
 
 
-def _cut_routes(whole: Segments, part: Array, key: Array) -> Segments:
+def _cut_routes(routes: Segments, part: Array, key: Array) -> Segments:
     """A piece of each of two routes, from where they part; the pieces of every other pair are equally long."""
-    number, _, steps = whole.mask.shape
+    number, _, steps = routes.mask.shape
     most = min(LONGEST, steps)
     length = jax.random.randint(key, (number, 2, 1), SHORTEST, most + 1)
     length = jnp.where((jnp.arange(number) // 2 % 2 == 0)[:, None, None], length[:, :1], length)
     offset = jnp.arange(most)[None, None]
     place = part[:, None, None] + offset + jnp.zeros((1, 2, 1), int)
     take = lambda rows: jax.vmap(jax.vmap(lambda row, place: row[jnp.minimum(place, steps - 1)]))(rows, place)
-    piece = jax.tree.map(take, whole)
+    piece = jax.tree.map(take, routes)
     return piece._replace(mask=piece.mask & (offset < length) & (place < steps))
 
 

@@ -35,7 +35,7 @@ from peps_jax.reproduce.driving.scenes import road
 from peps_jax.round import round_at
 from peps_jax.storage import files
 from peps_jax.storage.arrays import write_arrays
-from peps_jax.train import Result, check, collect_and_ask, finish, hear, init, learn_and_improve, prepare
+from peps_jax.train import Result, check, finish, halves, init, prepare, run_with_host
 from peps_jax.train import train as trained
 
 LOOK = 0.05  # s between two looks whether a round is closed
@@ -307,28 +307,12 @@ def _check_answers(database: Database, round: Round) -> None:
     raise DiffersError(f"round {round.number} was closed with other answers ({round.why}): now {what}")
 
 
-def run(config: Config, host: Host, after: Callable[[Result, int], None] = lambda result, index: None) -> Result:
+def run(config: Config, host: Host, after: Callable[[Result, int], None] | None = None) -> Result:
     """`train(config, teachers.host(host))`, with `after` called at the end of each round with what was learned so far."""
     check(config)
-    training = prepare(config, teachers.host(host))
-    state, rows = init(training, teachers.host(host)), []
-    for index in range(training.settings.schedule.num_rounds):
-        now = round_at(jnp.asarray(index, jnp.int32), state.key, training.settings.schedule)
-        state, queries, collected = _collect(state, now, training)
-        said = None if queries is None else host(jax.device_get(queries), index)
-        if said is not None:
-            state = _hear(state, data.checked(said, training.settings.queries.per_round), now)
-        state, learned = _learn(state, now, training)
-        rows.append(jax.device_get(collected | learned))
-        after(finish(state, _curves(rows), training), index)
-    return finish(state, _curves(rows), training)
-
-
-_collect, _hear, _learn = jax.jit(collect_and_ask), jax.jit(hear), jax.jit(learn_and_improve)
-
-
-def _curves(rows: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    teacher = teachers.host(host)
+    training = prepare(config, teacher)
+    return finish(*run_with_host(init(training, teacher), training, host, after), training)
 
 
 def warm_up(config: Config) -> None:
@@ -336,9 +320,10 @@ def warm_up(config: Config) -> None:
     training = prepare(config)
     state = init(training)
     now = round_at(jnp.zeros((), jnp.int32), state.key, training.settings.schedule)
-    state, queries, _ = _collect(state, now, training)
+    collect, file, learn = halves
+    state, queries, _ = collect(state, now, training)
     silent = Answers(*(np.zeros(queries.number.shape, kind) for kind in (np.int32, np.float32, np.float32)))
-    jax.block_until_ready(_learn(_hear(state, data.checked(silent, len(silent.number)), now), now, training))
+    jax.block_until_ready(learn(file(state, data.checked(silent, len(silent.number)), now), now, training))
 
 
 class Live:

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from peps_jax.config import Config
-from peps_jax.reproduce.plan import DOMAINS, FEW_SEEDS, Need, Plan
-from peps_jax.reproduce.summary import cells, head, line, write_texts
+from peps_jax.reproduce.plan import Need, Plan
+from peps_jax.reproduce.summary import cells, head, write_texts
+from peps_jax.reproduce.variants import lines_of, needs_of
 from peps_jax.storage.tables import csv_bytes, latex, markdown
 
 ABOUT = "PEPS and DRLHP without parts of them"
@@ -36,21 +37,12 @@ def variants(base: Config) -> dict[str, tuple[str, dict[str, Any]]]:
 
 def needs(plan: Plan) -> list[Need]:
     """Every variant in every domain, with few seeds."""
-    return [
-        training
-        for method, changes in variants(plan.base).values()
-        for domain in DOMAINS
-        for training in plan.trainings(domain, method, FEW_SEEDS, **changes)
-    ]
+    return needs_of(plan, variants(plan.base))
 
 
 def write(plan: Plan, folder: Path) -> list[Path]:
     """ablations.{md,csv,tex}."""
-    lines, few = [], min(FEW_SEEDS, plan.seeds)
-    for domains in (*([domain] for domain in DOMAINS), DOMAINS):
-        for name, (method, changes) in variants(plan.base).items():
-            groups = [plan.records(plan.trainings(domain, method, FEW_SEEDS, **changes)) for domain in domains]
-            lines.append(line(domains, name, groups, few * len(domains)))
+    lines = lines_of(plan, variants(plan.base))
     shown = [cells(made, paper=False) for made in lines]
     contents = {
         "ablations.md": markdown(head(paper=False), shown),

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from peps_jax.reproduce.plan import DOMAINS, FEW_SEEDS, Need, Plan
-from peps_jax.reproduce.summary import cells, head, line, write_texts
+from peps_jax.reproduce.plan import FEW_SEEDS, Need, Plan
+from peps_jax.reproduce.summary import cells, head, write_texts
+from peps_jax.reproduce.variants import lines_of, needs_of
 from peps_jax.storage.tables import csv_bytes, markdown
 
 ABOUT = "PEPS by teachers who err, are myopic, can't tell, skip, or believe different things"
@@ -23,6 +24,7 @@ TEACHERS: dict[str, dict[str, Any]] = {
     "a quarter of the answers by who knows the truth": {"informed": 0.25},
     "half of the answers by who knows the truth": {"informed": 0.5},
 }
+VARIANTS = {name: ("peps", changes) for name, changes in TEACHERS.items()}
 _NOTE = """\
 PEPS, the plan's number of queries, interquartile means over up to {seeds} seeds. A query that is skipped isn't asked again.
 """
@@ -30,21 +32,12 @@ PEPS, the plan's number of queries, interquartile means over up to {seeds} seeds
 
 def needs(plan: Plan) -> list[Need]:
     """PEPS by every teacher, with few seeds."""
-    return [
-        training
-        for changes in TEACHERS.values()
-        for domain in DOMAINS
-        for training in plan.trainings(domain, "peps", FEW_SEEDS, **changes)
-    ]
+    return needs_of(plan, VARIANTS)
 
 
 def write(plan: Plan, folder: Path) -> list[Path]:
     """teachers.{md,csv}."""
-    lines, few = [], min(FEW_SEEDS, plan.seeds)
-    for domains in (*([domain] for domain in DOMAINS), DOMAINS):
-        for name, changes in TEACHERS.items():
-            groups = [plan.records(plan.trainings(domain, "peps", FEW_SEEDS, **changes)) for domain in domains]
-            lines.append(line(domains, name, groups, few * len(domains)))
+    lines = lines_of(plan, VARIANTS)
     names = ["teacher" if name == "method" else name for name in head(paper=False)]
     table = markdown(names, [cells(made, paper=False) for made in lines])
     return write_texts(

@@ -9,6 +9,7 @@ import subprocess
 import sys
 
 import pytest
+from commands import exit_code
 from study_cases import Client, answer_to, make_study, rating_of, served
 
 from peps_jax.human_study import commands, tokens
@@ -22,10 +23,7 @@ def run(capsys):
     """Runs a command; its exit code and what it printed, on stdout and stderr."""
 
     def run(*arguments):
-        try:
-            code = commands.main(list(map(str, arguments)))
-        except SystemExit as error:
-            code = error.code
+        code = exit_code(commands.main, *arguments)
         printed = capsys.readouterr()
         return code, printed.out, printed.err
 

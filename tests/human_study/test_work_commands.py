@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import exit_code
 
 from peps_jax.config import Config
 from peps_jax.human_study import commands, making, pairs, simulated_participants
@@ -31,10 +32,7 @@ SMALL = """
 
 def run(capsys, *arguments):
     """A command's exit code, and what it printed on stdout and stderr."""
-    try:
-        code = commands.main(list(map(str, arguments)))
-    except SystemExit as exit:
-        code = exit.code
+    code = exit_code(commands.main, *arguments)
     printed = capsys.readouterr()
     return code, printed.out, printed.err
 

@@ -37,9 +37,9 @@ def road(name: str, **changes: Any) -> Config:
 
 
 def whole(trajectory: Trajectory) -> Segments:
-    """Scenes (n, horizon, ...) from what was collected from their start on, (horizon, n, ...); masked after a crash."""
+    """Scenes (n, horizon, ...) from what was collected from their start on, (horizon, n, ...); masked after their end."""
     rows = jax.tree.map(lambda rows: jnp.swapaxes(rows, 0, 1), trajectory)
-    over = rows.transition.terminated
+    over = rows.transition.terminated | rows.truncated
     return Segments(
         observation=rows.transition.observation,
         action=rows.transition.action,
