@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import functools
+import importlib
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
-from peps_envs import highway, navigation
+from peps_envs import highway, navigation, physics
 from peps_envs.environment import Environment
 
 
@@ -68,7 +70,14 @@ def _highway(domain: str) -> Callable[[], Task]:
     return lambda: Task(highway.Highway(), *highway.domain(domain))
 
 
+def _physics(module: str) -> Callable[[], Task]:
+    # kept, because a compiled MuJoCo model equals itself alone; imported when it is asked for, because MuJoCo takes a second
+    return functools.cache(lambda: Task(*importlib.import_module(f"peps_envs.physics.{module}").domain()))
+
+
 for _domain in navigation.DOMAINS:
     register(f"nav-{_domain}", _navigation(_domain))
 for _domain in highway.DOMAINS:
     register(f"highway-{_domain}", _highway(_domain))
+for _module in physics.MODULES:
+    register(f"mjx-{_module}", _physics(_module))

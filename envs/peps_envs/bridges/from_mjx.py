@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -42,6 +42,7 @@ class MjxState(NamedTuple):
     qacc_warmstart: Array  # (nv,) where the solver begins
     time: Array  # () s
     perceived: Array  # (perceived_size,)
+    events: Array  # (events,) bool
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -56,6 +57,8 @@ class FromMjx(Simulator):
     ends: Callable[[mjx.Data], Array] | None
     begin: Callable[[Array, mjx.Data], mjx.Data] | None
     draw: Callable[[mujoco.MjModel, mujoco.MjData], Scene] | None
+    event_names: tuple[str, ...]
+    signs: tuple[Callable[[mjx.Data], Array], ...]  # of the events
     low: tuple[float, ...]  # of the controls
     high: tuple[float, ...]
 
@@ -123,7 +126,13 @@ class FromMjx(Simulator):
         return mjx.kinematics(params, data)
 
     def _kept(self, data: mjx.Data) -> MjxState:
-        return MjxState(data.qpos, data.qvel, data.act, data.qacc_warmstart, jnp.asarray(data.time), self.look(data))
+        events = jnp.asarray([sign(data) for sign in self.signs], bool)
+        return MjxState(
+            data.qpos, data.qvel, data.act, data.qacc_warmstart, jnp.asarray(data.time), self.look(data), events
+        )
+
+    def happened(self, inner: MjxState) -> Array:
+        return inner.events
 
     def _control(self, action: Array) -> Array:
         low, high = jnp.asarray(self.low), jnp.asarray(self.high)
@@ -140,6 +149,7 @@ def from_mjx(
     substeps: int = 1,
     observe: Callable[[mjx.Data], Array] | None = None,
     terminated: Callable[[mjx.Data], Array] | None = None,
+    events: Mapping[str, Callable[[mjx.Data], Array]] | None = None,
     start: Callable[[Array, mjx.Data], mjx.Data] | None = None,
     scene: Callable[[mujoco.MjModel, mujoco.MjData], Scene] | None = None,
 ) -> FromMjx:
@@ -157,6 +167,7 @@ def from_mjx(
       substeps: MuJoCo's steps in one of the environment.
       observe: (data) -> (observation_size,); positions, velocities and activations unless it is given.
       terminated: (data) -> whether the MDP has ended; never unless it is given.
+      events: by their names, (data after a step) -> whether it happened.
       start: (key, data of the model's own pose) -> data of a start; that pose unless it is given.
       scene: (model, data of MuJoCo) -> what there is to see.
 
@@ -185,6 +196,8 @@ def from_mjx(
         ends=terminated,
         begin=start,
         draw=scene,
+        event_names=tuple(events or ()),
+        signs=tuple((events or {}).values()),
         low=tuple(model.actuator_ctrlrange[:, 0].tolist()),
         high=tuple(model.actuator_ctrlrange[:, 1].tolist()),
     )

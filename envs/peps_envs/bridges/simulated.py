@@ -79,6 +79,11 @@ class Simulator(Environment):
     def advance(self, key: Array, inner: Any, action: Array, params: Any) -> tuple[Any, Array, Array, Array]:
         """The simulator's next state, its observation, what it pays, and whether the MDP ended."""
 
+    def happened(self, inner: Any) -> Array:
+        """(len(event_names),) bool, the events of the step that led to a state of the simulator."""
+        del inner
+        return jnp.zeros(0, bool)
+
     def reset(self, key: Array, params: Any) -> tuple[SimulatedState, Array]:
         self.structure.check(params, self.name)
         inner, observation = self.start(key, params)
@@ -97,7 +102,7 @@ class Simulator(Environment):
         after = SimulatedState(inner, jnp.asarray(reward, state.reward.dtype).reshape(()), state.time + 1)
         terminated = jnp.asarray(terminated, bool).reshape(())
         truncated = (after.time >= self.horizon) & ~terminated
-        return Step(after, observation, after.reward, terminated, truncated, jnp.zeros(0, bool))
+        return Step(after, observation, after.reward, terminated, truncated, self.happened(inner))
 
     def reward(self, state: SimulatedState, action: Array, next_state: SimulatedState, params: Any) -> Array:
         if self.reward_of is None:
