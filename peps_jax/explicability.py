@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+import peps_envs
 from peps_jax.config import Problem
 from peps_jax.preferences import synthetic_human
 
@@ -39,9 +40,22 @@ class Score(NamedTuple):
         """sum r_H + sum (l_H - l_A)."""
         return self.human_return + self.belief_gap
 
+    @property
+    def worth(self) -> Array:
+        """(..., 2) l_H + r_H and l_A + r_A: what who has the belief, and who knows the truth, think of it."""
+        return jnp.stack([self.log_belief + self.human_return, self.log_true + self.return_], -1)
+
+
+def judged_step(problem: Problem, key: Array, state: Any, action: Array) -> tuple[peps_envs.Step, Score]:
+    """One step of the true dynamics, and its score; every field of it is () float32."""
+    after, judged = problem.environment.judged_step(key, state, action, problem.params, problem.belief)
+    score = Score(after.reward, judged.human_reward, judged.log_belief, judged.log_true)
+    chex.assert_shape(list(score), ())
+    return after, Score(*(jnp.asarray(value, jnp.float32) for value in score))
+
 
 def score(problem: Problem, state: Any, action: Array, next_state: Any) -> Score:
-    """The score of one transition; every field is () float32."""
+    """The score of one transition that happened before; every field is () float32."""
     environment, params = problem.environment, problem.params
     log_belief, human_reward = synthetic_human.log_weight(environment, problem.belief, state, action, next_state)
     expected = environment.next_state_distribution(state, action, params)

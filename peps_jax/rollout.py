@@ -95,35 +95,34 @@ def collect(
     """
     environment, params = problem.environment, problem.params
     reset = jax.vmap(environment.reset, in_axes=(0, None))
-    step = jax.vmap(environment.step, in_axes=(0, 0, 0, None))
+    step = jax.vmap(lambda key, state, action: explicability.judged_step(problem, key, state, action))
     split = lambda key: jax.random.split(key, settings.num_envs)
 
-    def step_all(carry: tuple[Any, Array], now: tuple[Array, Array]) -> tuple[tuple[Any, Array], Trajectory]:
+    def step_all(
+        carry: tuple[Any, Array], now: tuple[Array, Array]
+    ) -> tuple[tuple[Any, Array], tuple[Trajectory, Score]]:
         state, observation = carry
         time, key = now
         key_act, key_env, key_reset = jax.random.split(key, 3)
         action = act(observation, key_act, time)
         chex.assert_axis_dimension(action, 0, settings.num_envs)
-        after = step(split(key_env), state, action, params)
+        after, score = step(split(key_env), state, action)
         chex.assert_shape([after.reward, after.terminated, after.truncated], (settings.num_envs,))
         seen, over = _seen(after.observation), after.terminated | after.truncated
         start, first = reset(split(key_reset), params)
         restart = lambda new, old: jax.vmap(jnp.where)(over, new, old)
         moved = jax.vmap(movement, in_axes=(0, 0, None))(state, after.state, problem)
-        unscored = jnp.zeros(settings.num_envs, jnp.float32)  # all steps are scored at once, below
-        transition = Transition(observation, action, after.reward, seen, moved, after.terminated, unscored)
-        row = Trajectory(transition, after.truncated, after.events, state, after.state)
-        return (jax.tree.map(restart, start, after.state), restart(_seen(first), seen)), row
+        human_value = score.log_belief + score.human_return
+        transition = Transition(observation, action, after.reward, seen, moved, after.terminated, human_value)
+        row = Trajectory(transition, after.truncated, after.events, score.worth, state, after.state)
+        return (jax.tree.map(restart, start, after.state), restart(_seen(first), seen)), (row, score)
 
     times = jnp.arange(settings.length, dtype=jnp.int32)
     keys = jax.random.split(key, settings.length)
-    (state, observation), trajectory = jax.lax.scan(step_all, (actors.state, actors.observation), (times, keys))
-
-    score = jax.vmap(jax.vmap(lambda *transition: explicability.score(problem, *transition)))
-    scores = score(trajectory.state, trajectory.transition.action, trajectory.next_state)
-    transition = trajectory.transition._replace(human_value=scores.log_belief + scores.human_return)
-    trajectory = trajectory._replace(transition=transition)
-    over = transition.terminated | trajectory.truncated
+    (state, observation), (trajectory, scores) = jax.lax.scan(
+        step_all, (actors.state, actors.observation), (times, keys)
+    )
+    over = trajectory.transition.terminated | trajectory.truncated
     values = Running(scores, jnp.ones_like(scores.return_))
     totals, running = explicability.episode_sums(values, over, actors.running)
     return (

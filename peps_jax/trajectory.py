@@ -25,5 +25,6 @@ class Trajectory(NamedTuple):
     transition: Transition
     truncated: Array  # (steps, num_envs) bool
     events: Array  # (steps, num_envs, len(event_names)) bool
+    worth: Array  # (steps, num_envs, 2) what a synthetic human with the belief, and one who knows the truth, think of a step
     state: Any
     next_state: Any

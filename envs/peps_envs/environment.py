@@ -66,6 +66,14 @@ class Step(NamedTuple):
     events: Array  # (len(event_names),) bool, what happened in this step
 
 
+class Judgement(NamedTuple):
+    """What a human thinks of a step that happened, and how well the truth itself predicts it: all ()."""
+
+    human_reward: Array  # r_H(s, a, s')
+    log_belief: Array  # l_H(s'|s, a)
+    log_true: Array  # l_A(s'|s, a)
+
+
 class Environment(abc.ABC):
     """An MDP as pure functions. Subclasses are frozen dataclasses: equal fields mean the same code, so one compiled program.
 
@@ -115,10 +123,28 @@ class Environment(abc.ABC):
         weights = jnp.full(self.random_draws, 1 / self.random_draws, outcomes.dtype)
         return Mixture(outcomes, weights, self.perception_width(params))
 
+    def judged_step(self, key: Array, state: Any, action: Array, params: Any, belief: Any) -> tuple[Step, Judgement]:
+        """`step` under `params`, and what a human who believes `belief` thinks of what happened.
+
+        Who can make steps under two parameter sets at once for less than two overrides this.
+        """
+        after = self.step(key, state, action, params)
+        perceived = self.perceive(after.state)
+        log_prob = lambda params: self.next_state_distribution(state, action, params).relative_log_prob(perceived)
+        # both at once: a density stands once in a program
+        log_belief, log_true = jax.vmap(log_prob)(side_by_side(belief, params))
+        human_reward = self.reward(state, action, after.state, belief)
+        return after, Judgement(human_reward, log_belief, log_true)
+
     def scene(self, state: Any, params: Any) -> Scene | None:
         """What there is to see of `state`; None of an environment that has no picture. NumPy in, plain Python out: not traced."""
         del state, params
         return None
+
+
+def side_by_side(*params: Any) -> Any:
+    """Parameter sets of one structure along a leading axis, for `jax.vmap`."""
+    return jax.tree.map(lambda *leaves: jnp.stack(jnp.broadcast_arrays(*leaves)), *params)
 
 
 def event(environment: Environment, events: Array, name: str) -> Array:

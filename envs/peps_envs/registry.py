@@ -8,7 +8,7 @@ import importlib
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
-from peps_envs import highway, navigation, physics
+from peps_envs import highway, navigation
 from peps_envs.environment import Environment
 
 
@@ -24,6 +24,7 @@ class Task(NamedTuple):
         return next(iter(self.beliefs))
 
 
+PHYSICS: tuple[str, ...] = ()  # modules of `peps_envs.physics`
 _TASKS: dict[str, Callable[[], Task]] = {}
 
 
@@ -79,5 +80,5 @@ for _domain in navigation.DOMAINS:
     register(f"nav-{_domain}", _navigation(_domain))
 for _domain in highway.DOMAINS:
     register(f"highway-{_domain}", _highway(_domain))
-for _module in physics.MODULES:
+for _module in PHYSICS:
     register(f"mjx-{_module}", _physics(_module))

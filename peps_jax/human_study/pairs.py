@@ -168,7 +168,7 @@ def segments_of(task: Problem, stimuli: Sequence[Stimulus]) -> Segments:
 
 
 def _each(segments: Segments) -> list[Segments]:
-    segments = jax.tree.map(np.asarray, segments)
+    segments = jax.tree.map(np.asarray, segments._replace(worth=None))  # what people are shown, and nothing else
     at = lambda place: jax.tree.map(lambda rows: rows[place], segments)
     return list(map(at, range(len(segments.mask))))
 

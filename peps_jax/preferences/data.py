@@ -36,6 +36,8 @@ class Segments(NamedTuple):
     reward: Array  # (..., steps) r_A, that the agent observed
     state: Any  # (..., steps, ...) the environment's state before each step: what a person is shown
     next_state: Any  # (..., steps, ...) and after it
+    # (..., steps, 2) what a synthetic human with the belief, and one who knows the truth, think of each step; None: not known yet
+    worth: Array | None = None
 
 
 class Queries(NamedTuple):

@@ -45,6 +45,7 @@ def candidates(trajectory: Trajectory, key: Array, settings: QuerySettings) -> S
         reward=cut.transition.reward,
         state=cut.state,
         next_state=cut.next_state,
+        worth=cut.worth,
     )
 
 

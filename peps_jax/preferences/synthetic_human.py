@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 import peps_envs
+from peps_envs.environment import side_by_side
 from peps_jax.config import Problem
 from peps_jax.preferences.data import Answers, Queries, Segments
 from peps_jax.settings import HumanSettings
@@ -31,29 +32,37 @@ def log_weight(
     )
 
 
-def segment_values(
-    segments: Segments, environment: peps_envs.Environment, belief: Any, settings: HumanSettings
-) -> Array:
-    """Z of Eq. (2) for each segment, (...): what the human thinks of it, with its end weighed more if it is myopic."""
-    score = lambda state, action, next_state: sum(log_weight(environment, belief, state, action, next_state))
+def judge(segments: Segments, problem: Problem) -> Array:
+    """(..., steps, 2) l + r of each step, by the problem's belief and by the truth."""
+    beliefs = side_by_side(problem.belief, problem.params)  # both at once: one density in the program
+
+    def score(state: Any, action: Array, next_state: Any) -> Array:
+        return jax.vmap(lambda belief: sum(log_weight(problem.environment, belief, state, action, next_state)))(beliefs)
+
     for _ in segments.mask.shape:
         score = jax.vmap(score)
-    values = score(segments.state, segments.action, segments.next_state)
+    return score(segments.state, segments.action, segments.next_state)
+
+
+def segment_values(segments: Segments, problem: Problem, settings: HumanSettings) -> Array:
+    """Z of Eq. (2) for each segment, (..., 2): what who has the belief, and who knows the truth, think of it.
+
+    Its end is weighed more if they are myopic. Steps that were judged when they were made, by the problem's belief, aren't again.
+    """
+    values = judge(segments, problem) if segments.worth is None else segments.worth
     shown = jnp.where(segments.mask, 1.0, 0.0).astype(jnp.float32)
     steps_to_end = jnp.sum(shown, -1, keepdims=True) - jnp.cumsum(shown, -1)
     weight = settings.myopia ** jnp.maximum(steps_to_end, 0.0)
-    return jnp.sum(jnp.where(segments.mask, values, 0.0) * weight, -1).astype(jnp.float32)
+    return jnp.sum(jnp.where(segments.mask[..., None], values, 0.0) * weight[..., None], -2).astype(jnp.float32)
 
 
 def answer(key: Array, queries: Queries, problem: Problem, settings: HumanSettings) -> Answers:
     """The synthetic human's answers to `queries`."""
     key_choice, key_mistake = jax.random.split(key)
     chance = lambda key: jax.random.uniform(key, queries.number.shape, jnp.float32)
-    # both at once: one density in the program
-    beliefs = jax.tree.map(lambda *both: jnp.stack(jnp.broadcast_arrays(*both)), problem.belief, problem.params)
-    both = jax.vmap(lambda belief: segment_values(queries.segments, problem.environment, belief, settings))(beliefs)
+    both = segment_values(queries.segments, problem, settings)  # (queries, 2, 2)
     knows = chance(jax.random.fold_in(key, 1)) < settings.informed
-    values = jnp.where(knows[:, None], both[1], both[0])  # (queries, 2)
+    values = jnp.where(knows[:, None], both[..., 1], both[..., 0])  # (queries, 2)
     difference = values[:, 0] - values[:, 1]
     first = chance(key_choice) < jax.nn.sigmoid(settings.rationality * difference)
     mistaken = chance(key_mistake) < settings.mistake_rate

@@ -17,7 +17,7 @@ NAMES = peps_envs.names()
 
 @functools.cache
 def seen(name: str) -> tuple:
-    """States before and after, actions and what `step` returned, of a few random steps; and l under the truth and each belief."""
+    """What `judged_step` returned of a few random steps, and l and r under the truth and each belief."""
     task = peps_envs.make(name)
     environment, space = task.environment, task.environment.action_space
 
@@ -29,13 +29,13 @@ def seen(name: str) -> tuple:
     def move(state, key):
         key_act, key_step = jax.random.split(key)
         action = random_action(key_act)
-        after = environment.step(key_step, state, action, task.params)
+        after, judged = environment.judged_step(key_step, state, action, task.params, task.beliefs[task.default_belief])
         density = lambda params: environment.next_state_distribution(state, action, params)
         surprises = {belief: density(params).relative_log_prob(environment.perceive(after.state))
                      for belief, params in (task.beliefs | {"truth": task.params}).items()}  # fmt: skip
         rewards = {belief: environment.reward(state, action, after.state, params)
                    for belief, params in (task.beliefs | {"truth": task.params}).items()}  # fmt: skip
-        return after.state, (after, environment.perceive(after.state), surprises, rewards)
+        return after.state, (after, environment.perceive(after.state), surprises, rewards, judged)
 
     @jax.jit
     def walk(key):
@@ -61,8 +61,17 @@ def test_a_step_returns_what_it_has_to(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_rewards_are_those_of_the_step(name):
-    _, (after, _, _, rewards) = seen(name)
+    _, (after, _, _, rewards, _) = seen(name)
     np.testing.assert_allclose(rewards["truth"], after.reward, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_step_is_judged_as_its_parts_are(name):
+    belief = peps_envs.make(name).default_belief
+    _, (_, _, surprises, rewards, judged) = seen(name)
+    np.testing.assert_allclose(judged.human_reward, rewards[belief], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(judged.log_belief, surprises[belief], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(judged.log_true, surprises["truth"], rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -78,7 +87,7 @@ def test_beliefs_are_values_of_the_same_parameters(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_densities_are_relative_to_the_kernel(name):
     task = peps_envs.make(name)
-    _, (_, perceived, surprises, _) = seen(name)
+    _, (_, perceived, surprises, *_) = seen(name)
     width = task.environment.perception_width(task.params)
     assert perceived.shape == (STEPS, *width.shape)
     assert np.all(width > 0)

@@ -172,15 +172,17 @@ def test_a_belief_expects_what_the_other_model_does():
     def surprise(state, after, model):
         return environment.next_state_distribution(state, action, model).relative_log_prob(environment.perceive(after))
 
+    judged = jax.jit(lambda state: environment.judged_step(jax.random.key(0), state, action, heavy, light)[1])
     state, _ = environment.reset(jax.random.key(0), heavy)
     found = []
     for _ in range(60):
         after = step(state, heavy)
-        found.append([surprise(state, after, heavy), surprise(state, after, light)])
+        found.append([surprise(state, after, heavy), surprise(state, after, light), judged(state).log_belief])
         state = after
-    knows, believes = np.array(found).T
+    knows, believes, side_by_side = np.array(found).T
     assert np.all(knows > -1e-6)
     assert believes.min() < -0.01
+    np.testing.assert_allclose(side_by_side, believes, rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.long

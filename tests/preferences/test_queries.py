@@ -100,7 +100,9 @@ def collected(steps=10, num_envs=3, ends=()):
         place, jnp.zeros_like(place), jnp.zeros((steps, num_envs)), place + 1, jnp.ones_like(place), terminated,
         jnp.zeros((steps, num_envs)),
     )  # fmt: skip
-    return Trajectory(transition, over, jnp.zeros((steps, num_envs, 1), bool), point, point)
+    return Trajectory(
+        transition, over, jnp.zeros((steps, num_envs, 1), bool), jnp.zeros((steps, num_envs, 2)), point, point
+    )
 
 
 def test_candidates_are_pieces_of_one_environment(line):

@@ -36,8 +36,8 @@ def share_of_first(config, segments, key=0):
 
 
 def values_of(segments, config):
-    problem = config.problem()
-    return synthetic_human.segment_values(segments, problem.environment, problem.belief, settings(config).human)
+    """By the belief."""
+    return synthetic_human.segment_values(segments, config.problem(), settings(config).human)[..., 0]
 
 
 def test_log_weight_is_belief_and_reward(line):
@@ -51,6 +51,14 @@ def test_segment_values_sum_up_to_the_mask(line):
     values = values_of(query([0.1, 0.2, 9.0], [0.3, 0.0, 0.1], [[1, 1, 0], [1, 1, 1]]), line)
     expected = [sum(weight(place, line.belief) for place in places) for places in ([0.1, 0.2], [0.3, 0.0, 0.1])]
     np.testing.assert_allclose(values[0], expected, rtol=1e-5)
+
+
+def test_what_was_judged_when_it_was_made_is_not_judged_again(line):
+    segments = query([0.1, 0.2, 9.0], [0.3, 0.0, 0.1], [[1, 1, 0], [1, 1, 1]])
+    said = synthetic_human.judge(segments, line.problem())
+    np.testing.assert_allclose(values_of(segments._replace(worth=said), line), values_of(segments, line), rtol=1e-6)
+    doubled = values_of(segments._replace(worth=2 * said, state=None), line)
+    np.testing.assert_allclose(doubled, 2 * values_of(segments, line), rtol=1e-6)
 
 
 def test_myopia_weighs_the_end(line):

@@ -23,6 +23,7 @@ LAYERS = (
     ("peps_envs.*",),  # environments of one file, which register themselves
     ("peps_envs",),
     ("peps_envs.bridges",),
+    ("peps_envs.physics",),
     ("peps_jax.storage", "peps_jax.trajectory", "peps_jax.generator"),
     ("peps_jax.fields",),
     ("peps_jax.config",),

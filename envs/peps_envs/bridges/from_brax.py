@@ -28,7 +28,6 @@ from jax import Array
 
 from peps_envs.bridges.simulated import SimulatedState, Simulator, Structure, check_flat
 from peps_envs.environment import Bounds, Box
-from peps_envs.perception import PerceivedDensity
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -49,11 +48,7 @@ class FromBrax(Simulator):
         after = self._with(params).step(inner, action)
         return after, self._seen(after), after.reward, after.done > 0.5
 
-    def next_state_distribution(self, state: SimulatedState, action: Array, params: Any) -> PerceivedDensity:
-        return super().next_state_distribution(self.adopted(state, params), action, params)
-
     def adopted(self, state: SimulatedState, params: Any) -> SimulatedState:
-        """`state`, whichever system made it, as one that `params` can go on from."""
         env, before = self._with(params), state.inner.pipeline_state
         if env.backend == "mjx":  # which derives everything at a step's beginning
             return state

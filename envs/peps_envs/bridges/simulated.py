@@ -17,7 +17,8 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from peps_envs.environment import ActionSpace, Bounds, Discrete, Environment, Step
+from peps_envs.environment import ActionSpace, Bounds, Discrete, Environment, Judgement, Step, side_by_side
+from peps_envs.perception import Gaussian, PerceivedDensity
 
 
 @struct.dataclass
@@ -103,6 +104,31 @@ class Simulator(Environment):
         terminated = jnp.asarray(terminated, bool).reshape(())
         truncated = (after.time >= self.horizon) & ~terminated
         return Step(after, observation, after.reward, terminated, truncated, self.happened(inner))
+
+    def judged_step(
+        self, key: Array, state: SimulatedState, action: Array, params: Any, belief: Any
+    ) -> tuple[Step, Judgement]:
+        """A simulator without chance steps in truth and in the belief side by side: its step stands once in a program."""
+        if self.random_draws > 1:
+            return super().judged_step(key, state, action, params, belief)
+        states = side_by_side(state, self.adopted(state, belief))
+        step = lambda state, params: self.step(key, state, action, params)
+        both = jax.vmap(step)(states, side_by_side(params, belief))
+        of = lambda which: jax.tree.map(lambda rows: rows[which], both)
+        after, imagined = of(0), of(1)
+        expected = self.perceive(imagined.state)
+        density = Gaussian(expected, jnp.zeros_like(expected), self.perception_width(belief))
+        log_belief = density.relative_log_prob(self.perceive(after.state))
+        human_reward = self.reward(state, action, after.state, belief)
+        return after, Judgement(human_reward, log_belief, jnp.zeros_like(log_belief))
+
+    def next_state_distribution(self, state: SimulatedState, action: Array, params: Any) -> PerceivedDensity:
+        return super().next_state_distribution(self.adopted(state, params), action, params)
+
+    def adopted(self, state: SimulatedState, params: Any) -> SimulatedState:
+        """`state`, whichever parameters it was made by, as one that `params` can go on from."""
+        del params
+        return state
 
     def reward(self, state: SimulatedState, action: Array, next_state: SimulatedState, params: Any) -> Array:
         if self.reward_of is None:

@@ -1,7 +1,5 @@
 """Physics in which people's beliefs are wrong in ways that have been measured: tasks on small MuJoCo models, stepped by MJX.
 
-A module for each, with its models' XML and `domain()`, which makes the environment, its true model, and beliefs. They are
-imported when a task is made, because MuJoCo and MJX take a second.
+A module for each, with its models' XML and `domain()`, which makes the environment, its true model, and beliefs. The registry
+names them and imports one when its task is made, because MuJoCo and MJX take a second.
 """
-
-MODULES = ()  # `mjx-` and a module's name is a task's name
