@@ -65,7 +65,7 @@ class Config:
     method: str = static(
         "peps",
         None,
-        "what is learned, and from which reward: peps, sac, drlhp, policy_shaping, oracle or human_expectation",
+        "what is learned, and from which reward: peps, sac, drlhp, policy_shaping, oracle, darc or human_expectation",
         group="task",
     )
     seed: Any = traced(0, COUNT_OR_NONE, "random seed", group="task")

@@ -112,7 +112,7 @@ def evaluate_policy(
         state, observation, alive = carry
         key_act, key_env = jax.random.split(key)
         action, log_policy = policy(observation, key_act if stochastic else None)
-        after, score = explicability.judged_step(problem, key_env, state, action)
+        after, score, _ = explicability.judged_step(problem, key_env, state, action)
         hold = lambda new, old: jax.tree.map(lambda new, old: jnp.where(alive, new, old), new, old)
         next_state, next_observation = hold(after.state, state), hold(after.observation, observation)
         still = alive & ~(after.terminated | after.truncated)

@@ -46,12 +46,12 @@ class Score(NamedTuple):
         return jnp.stack([self.log_belief + self.human_return, self.log_true + self.return_], -1)
 
 
-def judged_step(problem: Problem, key: Array, state: Any, action: Array) -> tuple[peps_envs.Step, Score]:
-    """One step of the true dynamics, and its score; every field of it is () float32."""
+def judged_step(problem: Problem, key: Array, state: Any, action: Array) -> tuple[peps_envs.Step, Score, Array]:
+    """One step of the true dynamics; its score, every field of which is () float32; and what the human imagines, as perceived."""
     after, judged = problem.environment.judged_step(key, state, action, problem.params, problem.belief)
     score = Score(after.reward, judged.human_reward, judged.log_belief, judged.log_true)
     chex.assert_shape(list(score), ())
-    return after, Score(*(jnp.asarray(value, jnp.float32) for value in score))
+    return after, Score(*(jnp.asarray(value, jnp.float32) for value in score)), judged.imagined
 
 
 def score(problem: Problem, state: Any, action: Array, next_state: Any) -> Score:

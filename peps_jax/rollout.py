@@ -106,14 +106,24 @@ def collect(
         key_act, key_env, key_reset = jax.random.split(key, 3)
         action = act(observation, key_act, time)
         chex.assert_axis_dimension(action, 0, settings.num_envs)
-        after, score = step(split(key_env), state, action)
+        after, score, imagined = step(split(key_env), state, action)
         chex.assert_shape([after.reward, after.terminated, after.truncated], (settings.num_envs,))
         seen, over = _seen(after.observation), after.terminated | after.truncated
         start, first = reset(split(key_reset), params)
         restart = lambda new, old: jax.vmap(jnp.where)(over, new, old)
         moved = jax.vmap(movement, in_axes=(0, 0, None))(state, after.state, problem)
-        human_value = score.log_belief + score.human_return
-        transition = Transition(observation, action, after.reward, seen, moved, after.terminated, human_value)
+        moved_in_mind = jax.vmap(movement_to, in_axes=(0, 0, None))(state, imagined, problem)
+        transition = Transition(
+            observation=observation,
+            action=action,
+            reward=after.reward,
+            next_observation=seen,
+            movement=moved,
+            terminated=after.terminated,
+            human_reward=score.human_return,
+            log_belief=score.log_belief,
+            imagined=moved_in_mind if settings.imagines else None,
+        )
         row = Trajectory(transition, after.truncated, after.events, score.worth, state, after.state)
         return (jax.tree.map(restart, start, after.state), restart(_seen(first), seen)), (row, score)
 
@@ -134,8 +144,13 @@ def collect(
 
 def movement(state: Any, next_state: Any, problem: Problem) -> Array:
     """How the perceived state moves in a step, in units of sigma_p, (perceived_size,): what T_A predicts."""
-    perceive, width = problem.environment.perceive, problem.environment.perception_width(problem.params)
-    return ((perceive(next_state) - perceive(state)) / width).astype(jnp.float32)
+    return movement_to(state, problem.environment.perceive(next_state), problem)
+
+
+def movement_to(state: Any, perceived: Array, problem: Problem) -> Array:
+    """The same, to a next state as it is perceived."""
+    width = problem.environment.perception_width(problem.params)
+    return ((perceived - problem.environment.perceive(state)) / width).astype(jnp.float32)
 
 
 def _seen(observation: Array) -> Array:

@@ -53,6 +53,7 @@ class RolloutSettings:
     num_envs: int = _static()
     length: int = _static()  # steps of each environment in a round
     hold_steps: int = _static()  # for which a random action is held
+    imagines: bool = _static()  # whether what the human imagines is kept, for a method that learns from it
     exploration: Array  # share of the steps with random actions
 
 
@@ -163,7 +164,7 @@ def settings_of(config: Config, problem: Problem) -> Settings:
     return Settings(
         objective=_record(ObjectiveSettings, config, entropy_offset=_entropy_offset(config, problem)),
         schedule=_record(ScheduleSettings, config),
-        rollout=_record(RolloutSettings, config, length=config.rollout_length),
+        rollout=_record(RolloutSettings, config, length=config.rollout_length, imagines=False),
         agent=_record(AgentSettings, config, updates=config.updates_per_round, **spaces),
         dynamics=_record(
             DynamicsSettings,

@@ -16,7 +16,12 @@ class Transition(NamedTuple):
     next_observation: Array  # (..., observation_size), of the last step too, not of the next episode's start
     movement: Array  # (..., perceived_size) of the perceived state in the step, in units of sigma_p: what T_A predicts
     terminated: Array  # (...) bool: the MDP ended; False where only time ran out
-    human_value: Array  # (...) l_H + r_H, what the human thinks of it: nobody knows it but the oracle
+    # what nobody knows but the yardsticks, the oracle and DARC
+    human_reward: Array  # (...) r_H
+    log_belief: Array  # (...) l_H
+    imagined: Array | None = (
+        None  # (..., perceived_size) the movement that the human imagines, where a method learns from it
+    )
 
 
 class Trajectory(NamedTuple):

@@ -49,7 +49,10 @@ class Places(PerceivedDensity):
     def relative_log_prob(self, perceived: Array) -> Array:
         return jnp.log(self.probabilities[perceived[0].astype(jnp.int32)])
 
-    relative_entropy = sample = None
+    def sample(self, key: Array) -> Array:
+        return jax.random.categorical(key, jnp.log(self.probabilities)).astype(jnp.float32)[None]
+
+    relative_entropy = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +83,8 @@ class Chain(Environment):
     def perceive(self, state: ChainState) -> Array:
         return state.place.astype(jnp.float32)[None]
 
-    perception_width = None
+    def perception_width(self, params: ChainParams) -> Array:
+        return jnp.ones(1)
 
 
 def chain(seed: int) -> tuple[ChainParams, np.ndarray]:

@@ -67,11 +67,12 @@ class Step(NamedTuple):
 
 
 class Judgement(NamedTuple):
-    """What a human thinks of a step that happened, and how well the truth itself predicts it: all ()."""
+    """What a human thinks of a step that happened, and how well the truth itself predicts it."""
 
-    human_reward: Array  # r_H(s, a, s')
-    log_belief: Array  # l_H(s'|s, a)
-    log_true: Array  # l_A(s'|s, a)
+    human_reward: Array  # () r_H(s, a, s')
+    log_belief: Array  # () l_H(s'|s, a)
+    log_true: Array  # () l_A(s'|s, a)
+    imagined: Array  # (perceived_size,) a next state as the human imagines it, drawn from T_H * K
 
 
 class Environment(abc.ABC):
@@ -130,11 +131,12 @@ class Environment(abc.ABC):
         """
         after = self.step(key, state, action, params)
         perceived = self.perceive(after.state)
-        log_prob = lambda params: self.next_state_distribution(state, action, params).relative_log_prob(perceived)
-        # both at once: a density stands once in a program
-        log_belief, log_true = jax.vmap(log_prob)(side_by_side(belief, params))
+        expects = lambda params: self.next_state_distribution(state, action, params)
+        densities = jax.vmap(expects)(side_by_side(belief, params))  # both at once: a density stands once in a program
+        log_belief, log_true = jax.vmap(lambda density: density.relative_log_prob(perceived))(densities)
+        imagined = jax.tree.map(lambda rows: rows[0], densities).sample(jax.random.fold_in(key, 1))
         human_reward = self.reward(state, action, after.state, belief)
-        return after, Judgement(human_reward, log_belief, log_true)
+        return after, Judgement(human_reward, log_belief, log_true, imagined)
 
     def scene(self, state: Any, params: Any) -> Scene | None:
         """What there is to see of `state`; None of an environment that has no picture. NumPy in, plain Python out: not traced."""

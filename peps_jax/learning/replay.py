@@ -15,7 +15,9 @@ from peps_envs import ActionSpace, Discrete
 from peps_jax.trajectory import Transition
 
 
-def init(capacity: int, observation_size: int, action_space: ActionSpace, perceived_size: int) -> Transition:
+def init(
+    capacity: int, observation_size: int, action_space: ActionSpace, perceived_size: int, imagines: bool = False
+) -> Transition:
     """An empty buffer of `capacity` transitions."""
     numbers = lambda *shape: jnp.zeros((capacity, *shape), jnp.float32)
     discrete = isinstance(action_space, Discrete)
@@ -26,7 +28,9 @@ def init(capacity: int, observation_size: int, action_space: ActionSpace, percei
         next_observation=numbers(observation_size),
         movement=numbers(perceived_size),
         terminated=jnp.zeros(capacity, bool),
-        human_value=numbers(),
+        human_reward=numbers(),
+        log_belief=numbers(),
+        imagined=numbers(perceived_size) if imagines else None,
     )
 
 

@@ -42,7 +42,8 @@ def learn(
 
 def reward(knowledge: Knowledge, transitions: Transition, settings: Settings) -> Array:
     """Eq. (6) without its policy entropy, with l_H + r_H in r-hat's place."""
-    return peps.objective(knowledge.dynamics, transitions, transitions.human_value, settings)
+    told = transitions.log_belief + transitions.human_reward
+    return peps.objective(knowledge.dynamics, transitions, told, settings)
 
 
 ORACLE = register(

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 SCORES = ("return", "explicability")
 TITLES = {
-    "peps": "PEPS", "sac": "SAC", "drlhp": "DRLHP", "policy_shaping": "policy shaping", "oracle": "oracle",
+    "peps": "PEPS", "sac": "SAC", "drlhp": "DRLHP", "policy_shaping": "policy shaping", "oracle": "oracle", "darc": "DARC",
     "human_expectation": "human",
 }  # fmt: skip
 

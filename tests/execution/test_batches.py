@@ -40,7 +40,7 @@ def test_predicted_memory_grows_as_what_it_counts(line):
     need = lambda **changes: program.memory_need(line.replace(method="sac", **changes), EPISODES)
     base, wider, longer = need(batch_size=1024), need(batch_size=2048), need(total_steps=16_000)
     assert 1.5 * base.working < wider.working < 2.5 * base.working
-    transition = 4 * 6 + 1  # bytes: two observations, action, reward, movement, human_value; terminated
+    transition = 4 * 7 + 1  # bytes: two observations, action, reward, movement, human_reward, log_belief; terminated
     assert longer.state - base.state == (16_000 - 160) * transition
 
 

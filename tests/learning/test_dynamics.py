@@ -33,7 +33,14 @@ def fitted(noise, config):
     after = observation + 0.1 * action + noise * jax.random.normal(key_noise, (NUMBER, 1))
     moved = (after - observation) / WIDTH
     replay = Transition(
-        observation, action, jnp.zeros(NUMBER), after, moved, jnp.zeros(NUMBER, bool), jnp.zeros(NUMBER)
+        observation,
+        action,
+        jnp.zeros(NUMBER),
+        after,
+        moved,
+        jnp.zeros(NUMBER, bool),
+        jnp.zeros(NUMBER),
+        jnp.zeros(NUMBER),
     )
     return dynamics.fit(dynamics.init(key_init, config), replay, NUMBER, key_fit, config)
 
@@ -86,7 +93,7 @@ def test_loss_is_the_negative_log_likelihood(config):
     member = jax.tree.map(lambda leaf: leaf[0], state.params)
     observation, action, after = jnp.array([[0.1], [0.3]]), jnp.array([[0.5], [-1.0]]), jnp.array([[0.2], [0.1]])
     moved = (after - observation) / WIDTH
-    batch = Transition(observation, action, jnp.zeros(2), after, moved, jnp.zeros(2, bool), jnp.zeros(2))
+    batch = Transition(observation, action, jnp.zeros(2), after, moved, jnp.zeros(2, bool), jnp.zeros(2), jnp.zeros(2))
     prediction = dynamics.predict(member, observation, action, config)
     sd = jnp.exp(prediction.log_sd)
     density = -0.5 * ((moved - prediction.mean) / sd) ** 2 - prediction.log_sd - 0.5 * np.log(2 * np.pi)

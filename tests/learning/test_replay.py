@@ -12,7 +12,9 @@ from peps_jax.trajectory import Transition
 def numbered(start, number):
     """Transitions that say in every field which they are."""
     index = jnp.arange(start, start + number, dtype=jnp.float32)
-    return Transition(index[:, None], index[:, None], index, index[:, None], index[:, None], index % 2 == 1, index)
+    return Transition(
+        index[:, None], index[:, None], index, index[:, None], index[:, None], index % 2 == 1, index, index
+    )
 
 
 def test_add_writes_at_its_position_and_nowhere_else():

@@ -120,7 +120,8 @@ def two_transitions():
     return Transition(
         observation=jnp.zeros((2, 1)), action=jnp.full((2, 1), 0.5), reward=jnp.array([3.0, 3.0]),
         next_observation=jnp.full((2, 1), 0.2), movement=jnp.full((2, 1), 2.0), terminated=jnp.array([True, False]),
-        human_value=jnp.zeros(2),
+        human_reward=jnp.zeros(2),
+        log_belief=jnp.zeros(2),
     )  # fmt: skip
 
 

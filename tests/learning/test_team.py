@@ -101,7 +101,7 @@ def _step(own):
     rows = jnp.linspace(-1.0, 1.0, 5)
     batch = Transition(
         observation=rows[:, None], action=rows[:, None], reward=rows, next_observation=rows[:, None] * 0.9,
-        movement=rows[:, None], terminated=rows > 0.9, human_value=rows,
+        movement=rows[:, None], terminated=rows > 0.9, human_reward=rows, log_belief=rows,
     )  # fmt: skip
     noises = tuple(sac.draw_noise(jax.random.key(seed), (5,), own) for seed in (1, 2))
     return team.Step(batch, (rows, -rows), noises, jax.random.key(3))

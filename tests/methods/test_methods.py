@@ -13,14 +13,14 @@ from conftest import LineParams, Probe, ProbeParams, settings
 import peps_jax
 from peps_envs import Box, Discrete
 from peps_jax import Config, methods
-from peps_jax.learning import dynamics, policy_heads, sac, team
+from peps_jax.learning import classifier, dynamics, policy_heads, sac, team
 from peps_jax.learning.policy_heads import Gaussian
 from peps_jax.methods import Method
 from peps_jax.round import round_at
 from peps_jax.train import collect_and_ask, init, prepare
 from peps_jax.trajectory import Transition
 
-EVERY = ("peps", "sac", "drlhp", "policy_shaping", "oracle", "human_expectation")
+EVERY = ("peps", "sac", "drlhp", "policy_shaping", "oracle", "darc", "human_expectation")
 EPISODES = 6
 
 
@@ -32,9 +32,11 @@ def evaluate():
 def test_the_methods_and_their_order():
     assert tuple(methods.METHODS) == EVERY
     text = Config.__dataclass_fields__["method"].metadata["help"]
-    places = [text.index(name) for name in ("peps", " sac", "drlhp", "policy_shaping", "oracle", "human_expectation")]
+    places = [
+        text.index(name) for name in ("peps", " sac", "drlhp", "policy_shaping", "oracle", "darc", "human_expectation")
+    ]
     assert places == sorted(places)
-    assert [name for name in EVERY if methods.get(name).uses_lam] == ["peps", "oracle"]
+    assert [name for name in EVERY if methods.get(name).uses_lam] == ["peps", "oracle", "darc"]
 
 
 def test_absolute_entropies_are_more_by_those_of_what_relative_ones_are_measured_against(tiny):
@@ -42,7 +44,9 @@ def test_absolute_entropies_are_more_by_those_of_what_relative_ones_are_measured
     knowledge = method.init(jax.random.key(0), settings(tiny))
     observation = jnp.zeros(problem.environment.observation_size)
     nothing = jnp.zeros(())
-    step = Transition(observation, jnp.zeros(2), nothing, observation, jnp.zeros(2), jnp.zeros((), bool), nothing)
+    step = Transition(
+        observation, jnp.zeros(2), nothing, observation, jnp.zeros(2), jnp.zeros((), bool), nothing, nothing
+    )
     reward = lambda kind: method.rewards[0](knowledge, step, settings(tiny.replace(lam=2.0, entropies=kind)))
     absolute, relative = reward("absolute"), reward("relative")
     kernel = distrax.MultivariateNormalDiag(
@@ -284,13 +288,35 @@ def test_the_oracle_is_told_what_the_human_thinks(line):
     assert asked is None
     rows = jax.tree.map(lambda rows: rows[: line.steps_per_round], state.replay)
     expected = -0.5 * math.log(2) - 2.0 * rows.next_observation[:, 0]
-    np.testing.assert_allclose(rows.human_value, expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(rows.log_belief + rows.human_reward, expected, rtol=1e-4, atol=1e-5)
+    assert rows.imagined is None
     entropy = dynamics.environment_entropy(
         state.knowledge.dynamics, rows.observation, rows.action, training.settings.dynamics
     )
     np.testing.assert_allclose(
         training.method.rewards[0](state.knowledge, rows, training.settings),
         rows.next_observation[:, 0] + line.lam * (expected + entropy), rtol=1e-4, atol=1e-4,
+    )  # fmt: skip
+
+
+def test_darc_is_told_the_humans_reward_and_what_the_human_imagines(line):
+    """Movements as they are on average, spread by the belief's 0.1 and the kernel's 0.1: by sqrt 2 kernels."""
+    training = prepare(line.replace(method="darc", belief=LineParams(noise=0.1, slope=-2.0), total_steps=2_000))
+    state = init(training)
+    now = round_at(jnp.asarray(0), state.key, training.settings.schedule)
+    state, asked, _ = jax.jit(collect_and_ask)(state, now, training)
+    assert asked is None
+    rows = jax.tree.map(lambda rows: rows[: line.steps_per_round], state.replay)
+    off = np.asarray(rows.imagined - rows.action)
+    assert off.shape == (line.steps_per_round, 1)
+    error = 4 * math.sqrt(2 / off.size)
+    assert abs(off.mean()) < error
+    assert abs(off.std() - math.sqrt(2)) < error
+    np.testing.assert_allclose(
+        training.method.rewards[0](state.knowledge, rows, training.settings),
+        rows.reward + line.lam * (
+            rows.human_reward + classifier.log_ratio(state.knowledge.classifier, rows, training.settings.dynamics)
+        ), rtol=1e-5,
     )  # fmt: skip
 
 

@@ -30,12 +30,12 @@ LAYERS = (
     ("peps_jax.settings",),
     ("peps_jax.round", "peps_jax.preferences"),  # below learning: what r-hat is fitted to is a set of preferences
     ("peps_jax.learning.networks", "peps_jax.learning.replay", "peps_jax.learning.policy_heads"),
-    ("peps_jax.learning.sac", "peps_jax.learning.dynamics", "peps_jax.learning.surrogate"),
+    *(tuple(f"peps_jax.learning.{name}" for name in ("classifier", "dynamics", "sac", "surrogate")),),
     ("peps_jax.learning",),
     ("peps_jax.methods.method",),
     ("peps_jax.methods.preference_based", "peps_jax.methods.sac"),
     *(tuple(f"peps_jax.methods.{name}" for name in ("drlhp", "human_expectation", "peps", "policy_shaping")),),
-    ("peps_jax.methods.oracle",),
+    ("peps_jax.methods.oracle", "peps_jax.methods.darc"),
     ("peps_jax.methods",),
     ("peps_jax.train", "peps_jax.rollout", "peps_jax.explicability"),
     ("peps_jax.evaluate",),
@@ -57,7 +57,9 @@ LAYERS = (
     ("peps_jax.human_study",),
 )
 LAYER_OF = {room: layer for layer, rooms in enumerate(LAYERS) for room in rooms}
-STRANGERS = {f"peps_jax.learning.{name}" for name in ("dynamics", "sac", "surrogate")}  # know nothing of one another
+STRANGERS = {
+    f"peps_jax.learning.{name}" for name in ("classifier", "dynamics", "sac", "surrogate")
+}  # know nothing of one another
 FRONT = (
     "peps_jax"  # its __init__ shows what users need, of whatever layer: commands may import it, what they use may not
 )

@@ -120,7 +120,8 @@ class Simulator(Environment):
         density = Gaussian(expected, jnp.zeros_like(expected), self.perception_width(belief))
         log_belief = density.relative_log_prob(self.perceive(after.state))
         human_reward = self.reward(state, action, after.state, belief)
-        return after, Judgement(human_reward, log_belief, jnp.zeros_like(log_belief))
+        drawn = density.sample(jax.random.fold_in(key, 1))
+        return after, Judgement(human_reward, log_belief, jnp.zeros_like(log_belief), drawn)
 
     def next_state_distribution(self, state: SimulatedState, action: Array, params: Any) -> PerceivedDensity:
         return super().next_state_distribution(self.adopted(state, params), action, params)
