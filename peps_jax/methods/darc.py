@@ -20,6 +20,8 @@ from peps_jax.round import Round
 from peps_jax.settings import Settings
 from peps_jax.trajectory import Transition
 
+MORE_UPDATES = 5  # of the classifier than T_A would have
+
 
 @struct.dataclass
 class Knowledge:
@@ -48,9 +50,17 @@ def reward(knowledge: Knowledge, transitions: Transition, settings: Settings) ->
     return transitions.reward + settings.objective.lam * (transitions.human_reward + log_ratio)
 
 
-def imagining(settings: Settings) -> Settings:
-    """With what the human imagines of every step."""
-    return settings.replace(rollout=settings.rollout.replace(imagines=True))
+def well_taught(settings: Settings) -> Settings:
+    """With what the human imagines of every step, and a classifier that is the critics' equal.
+
+    Of T_A's own size and pace it learns too slowly, and the policy stays well behind the oracle's.
+    """
+    size_and_pace = settings.dynamics.replace(
+        updates=MORE_UPDATES * settings.dynamics.updates,
+        hidden_sizes=settings.agent.hidden_sizes,
+        learning_rate=settings.agent.learning_rate,
+    )
+    return settings.replace(rollout=settings.rollout.replace(imagines=True), dynamics=size_and_pace)
 
 
 DARC = register(
@@ -58,7 +68,7 @@ DARC = register(
         name="darc",
         rewards=(reward,),
         uses_lam=True,
-        settings=imagining,
+        settings=well_taught,
         init=init,
         learn=learn,
         entropy_weight=peps.entropy_weight,
