@@ -1,0 +1,158 @@
+"""A sled at a frozen pond: people think that ice grips like snow.
+
+A propeller pushes the sled from the south-west corner to a goal in the north. It stands on a runner that touches the ground
+under gravity, so that Coulomb friction brakes it. Packed snow (friction 0.3) lies along the west and the north; the corner
+between is a frozen pond, whose ice has a sixth of that. Straight over the ice is quickest. Who believes that ice grips like snow
+expects the sled to lose another (0.3 - 0.05) g = 2.5 m/s^2 there, which is 5 cm in a control step of 0.2 s; on the snow it
+moves as expected.
+
+The snow lies on two planes that rise by 5 cm a metre from the pond's shore: MuJoCo's planes are infinite, and of planes
+that cut each other the higher one carries the sled. It is the ground's friction that decides (`priority`).
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+from mujoco import mjx
+
+from peps_envs.bridges.from_mjx import FromMjx, from_mjx
+from peps_envs.scene import Circle, Polyline, Scene, area
+
+ICE = 0.05  # friction of wet ice
+SNOW = 0.3  # friction of packed snow, and what people expect of ice
+RADIUS = 0.15  # m, of the sled's runner, a ball that doesn't roll
+HALF = 2.5  # m, half the arena's width
+START = (-1.8, -1.6)  # m
+SHORE = (-1.0, 1.0)  # m, x and y where the pond begins in the west and ends in the north
+GOAL = (1.7, 1.0, 2.5, 1.8)  # m, (x0, y0, x1, y1)
+SLOPE = 0.05  # of the snow, up from the shore
+SINKS = 0.025  # m, what the ground gives way under the sled's weight: g d (1 - d) timeconst^2
+SUBSTEPS = 4  # of 0.05 s
+HORIZON = 100  # control steps
+SIGMA = 0.02  # m, of the sled's position
+STEP_PRICE = 0.2
+PROGRESS = 1.0  # per metre that the distance to the goal shrinks
+GOAL_REWARD = 100.0
+TOP_SPEED = 2.5  # m/s, to which observed velocities are scaled
+GLIDE = 0.3  # s, for which the drawn line shows the sled's velocity
+
+# A ground as soft as `solimp` makes it keeps a sliding sled in touch; MuJoCo's friction lifts it from a stiffer one, so that it
+# hops at every other step. With fewer than 20 iterations of the line search the elliptic cone doesn't converge at rest.
+XML = """
+<mujoco model="ice">
+  <option timestep="0.05" integrator="implicitfast" cone="elliptic" jacobian="dense" iterations="6" ls_iterations="20"
+    tolerance="1e-10"/>
+  <default>
+    <geom condim="3" solref="0.1 1" solimp="0.5 0.5 0.001"/>
+    <default class="ground"><geom type="plane" size="4 4 1" priority="1" contype="2" conaffinity="1"/></default>
+  </default>
+  <worldbody>
+    <geom name="ice" class="ground" friction="{ice} 0 0"/>
+    <geom name="west" class="ground" pos="{west} 0 0" zaxis="{slope} 0 1" friction="{snow} 0 0"/>
+    <geom name="north" class="ground" pos="0 {north} 0" zaxis="0 -{slope} 1" friction="{snow} 0 0"/>
+    <body name="sled" pos="0 0 {height}">
+      <joint name="x" type="slide" axis="1 0 0" damping="2" range="-{reach} {reach}" solreflimit="0.1 1"/>
+      <joint name="y" type="slide" axis="0 1 0" damping="2" range="-{reach} {reach}" solreflimit="0.1 1"/>
+      <joint name="z" type="slide" axis="0 0 1"/>
+      <geom name="sled" type="sphere" size="{radius}" mass="1" contype="1" conaffinity="2"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor joint="x" gear="6" ctrlrange="-1 1"/>
+    <motor joint="y" gear="6" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>"""
+
+
+def model(friction: float = ICE) -> mujoco.MjModel:
+    """The sled at a pond whose ice has this friction, compiled; heights are above the ice, positions the arena's own."""
+    height = SLOPE * (SHORE[0] - START[0]) + RADIUS - SINKS  # at the start
+    return mujoco.MjModel.from_xml_string(
+        XML.format(
+            ice=friction,
+            snow=SNOW,
+            west=SHORE[0],
+            north=SHORE[1],
+            slope=SLOPE,
+            height=height,
+            reach=HALF - RADIUS,
+            radius=RADIUS,
+        )
+    )
+
+
+def start(key: Array, data: mjx.Data) -> mjx.Data:
+    """At rest in the south-west, on the snow."""
+    del key
+    return data.replace(qpos=jnp.array([*START, 0.0]))
+
+
+def observe(data: mjx.Data) -> Array:
+    """Position and velocity over ground, scaled to about [-1, 1], with a sine and cosine of each coordinate: (8,).
+
+    The ground changes at the shore; the waves let a small network see where.
+    """
+    place = data.qpos[:2] / HALF
+    return jnp.concatenate([place, data.qvel[:2] / TOP_SPEED, jnp.sin(jnp.pi * place), jnp.cos(jnp.pi * place)])
+
+
+def position(data: mjx.Data) -> Array:
+    """What people compare: where the sled is, (2,) m."""
+    return data.qpos[:2]
+
+
+def distance(data: mjx.Data) -> Array:
+    """From the sled's centre to the goal area, m; 0 inside."""
+    low, high = jnp.array(GOAL[:2]), jnp.array(GOAL[2:])
+    short = jnp.maximum(jnp.maximum(low - position(data), position(data) - high), 0.0)
+    return jnp.sqrt(jnp.sum(short**2))
+
+
+def arrived(data: mjx.Data) -> Array:
+    """Whether the sled's centre is in the goal area."""
+    return distance(data) <= 0
+
+
+def reward(data: mjx.Data, action: Array, after: mjx.Data, believed: mjx.Model) -> Array:
+    """-0.2 a step, 1 for each metre nearer to the goal, and 100 in it; the same to the agent and to people."""
+    del action, believed
+    return PROGRESS * (distance(data) - distance(after)) - STEP_PRICE + GOAL_REWARD * arrived(after)
+
+
+def scene(compiled: mujoco.MjModel, data: mujoco.MjData) -> Scene:
+    """The pond from above, its scratches, and the sled with a line that shows its velocity."""
+    del compiled
+    place, velocity = np.asarray(data.qpos[:2]), np.asarray(data.qvel[:2])
+    ahead = np.clip(place + GLIDE * velocity, -HALF, HALF)
+    scratches = (((-0.5, -1.9), (0.3, -1.2)), ((0.7, -0.4), (1.9, 0.3)), ((-0.6, 0.1), (-0.1, 0.5)), ((1.2, -2.0), (2.1, -1.5)))
+    shapes = (
+        area((-HALF, -HALF, HALF, HALF), "#f4f1e8"),
+        area((SHORE[0], -HALF, HALF, SHORE[1]), "ice"),
+        *(Polyline(line, "#ffffff") for line in scratches),
+        area(GOAL, "goal"),
+        Polyline((tuple(map(float, place)), tuple(map(float, ahead))), "ink"),
+        Circle(float(place[0]), float(place[1]), RADIUS, "agent", outline="ink"),
+    )
+    return Scene(shapes, (-HALF, HALF, -HALF, HALF))
+
+
+def domain() -> tuple[FromMjx, mjx.Model, dict[str, mjx.Model]]:
+    """The task, its true model, and beliefs: `biased` takes ice for as rough as snow, `unbiased` knows it."""
+    environment = from_mjx(
+        model(),
+        reward,
+        position,
+        (SIGMA, SIGMA),
+        horizon=HORIZON,
+        substeps=SUBSTEPS,
+        observe=observe,
+        terminated=arrived,
+        events={"goal_reached": arrived},
+        start=start,
+        scene=scene,
+    )
+    truth = environment.model(model())
+    return environment, truth, {"biased": environment.model(model(SNOW)), "unbiased": truth}
