@@ -1,9 +1,9 @@
 """A sled at a frozen pond: people think that ice grips like snow.
 
 A propeller pushes the sled from the south-west corner to a goal in the north. It stands on a runner that touches the ground
-under gravity, so that Coulomb friction brakes it. Packed snow (friction 0.3) lies along the west and the north; the corner
-between is a frozen pond, whose ice has a sixth of that. Straight over the ice is quickest. Who believes that ice grips like snow
-expects the sled to lose another (0.3 - 0.05) g = 2.5 m/s^2 there, which is 5 cm in a control step of 0.2 s; on the snow it
+under gravity, so that Coulomb friction brakes it. Packed snow (friction 0.25) lies along the west and the north; the corner
+between is a frozen pond, whose ice has a fifth of that. Straight over the ice is quickest. Who believes that ice grips like snow
+expects the sled to lose another (0.25 - 0.05) g = 2 m/s^2 there, which is 4 cm in a control step of 0.2 s; on the snow it
 moves as expected.
 
 The snow lies on two planes that rise by 5 cm a metre from the pond's shore: MuJoCo's planes are infinite, and of planes
@@ -22,20 +22,20 @@ from peps_envs.bridges.from_mjx import FromMjx, from_mjx
 from peps_envs.scene import Circle, Polyline, Scene, area
 
 ICE = 0.05  # friction of wet ice
-SNOW = 0.3  # friction of packed snow, and what people expect of ice
+SNOW = 0.25  # friction of packed snow, and what people expect of ice
 RADIUS = 0.15  # m, of the sled's runner, a ball that doesn't roll
-HALF = 2.5  # m, half the arena's width
-START = (-1.8, -1.6)  # m
-SHORE = (-1.0, 1.0)  # m, x and y where the pond begins in the west and ends in the north
-GOAL = (1.7, 1.0, 2.5, 1.8)  # m, (x0, y0, x1, y1)
+HALF = 2.0  # m, half the arena's width
+START = (-1.45, -1.3)  # m
+SHORE = (-0.8, 0.8)  # m, x and y where the pond begins in the west and ends in the north
+GOAL = (1.35, 0.8, 2.0, 1.45)  # m, (x0, y0, x1, y1)
 SLOPE = 0.05  # of the snow, up from the shore
 SINKS = 0.025  # m, what the ground gives way under the sled's weight: g d (1 - d) timeconst^2
 SUBSTEPS = 4  # of 0.05 s
 HORIZON = 100  # control steps
 SIGMA = 0.02  # m, of the sled's position
-STEP_PRICE = 0.2
-PROGRESS = 1.0  # per metre that the distance to the goal shrinks
-GOAL_REWARD = 100.0
+STEP_PRICE = 0.35
+PROGRESS = 2.0  # per metre that the distance to the goal shrinks
+GOAL_REWARD = 90.0
 TOP_SPEED = 2.5  # m/s, to which observed velocities are scaled
 GLIDE = 0.3  # s, for which the drawn line shows the sled's velocity
 
@@ -54,15 +54,15 @@ XML = """
     <geom name="west" class="ground" pos="{west} 0 0" zaxis="{slope} 0 1" friction="{snow} 0 0"/>
     <geom name="north" class="ground" pos="0 {north} 0" zaxis="0 -{slope} 1" friction="{snow} 0 0"/>
     <body name="sled" pos="0 0 {height}">
-      <joint name="x" type="slide" axis="1 0 0" damping="2" range="-{reach} {reach}" solreflimit="0.1 1"/>
-      <joint name="y" type="slide" axis="0 1 0" damping="2" range="-{reach} {reach}" solreflimit="0.1 1"/>
+      <joint name="x" type="slide" axis="1 0 0" damping="2.5" range="-{reach} {reach}" solreflimit="0.1 1"/>
+      <joint name="y" type="slide" axis="0 1 0" damping="2.5" range="-{reach} {reach}" solreflimit="0.1 1"/>
       <joint name="z" type="slide" axis="0 0 1"/>
       <geom name="sled" type="sphere" size="{radius}" mass="1" contype="1" conaffinity="2"/>
     </body>
   </worldbody>
   <actuator>
-    <motor joint="x" gear="6" ctrlrange="-1 1"/>
-    <motor joint="y" gear="6" ctrlrange="-1 1"/>
+    <motor joint="x" gear="8" ctrlrange="-1 1"/>
+    <motor joint="y" gear="8" ctrlrange="-1 1"/>
   </actuator>
 </mujoco>"""
 
@@ -117,7 +117,7 @@ def arrived(data: mjx.Data) -> Array:
 
 
 def reward(data: mjx.Data, action: Array, after: mjx.Data, believed: mjx.Model) -> Array:
-    """-0.2 a step, 1 for each metre nearer to the goal, and 100 in it; the same to the agent and to people."""
+    """-0.35 a step, 2 for each metre nearer to the goal, and 90 in it; the same to the agent and to people."""
     del action, believed
     return PROGRESS * (distance(data) - distance(after)) - STEP_PRICE + GOAL_REWARD * arrived(after)
 
@@ -127,7 +127,7 @@ def scene(compiled: mujoco.MjModel, data: mujoco.MjData) -> Scene:
     del compiled
     place, velocity = np.asarray(data.qpos[:2]), np.asarray(data.qvel[:2])
     ahead = np.clip(place + GLIDE * velocity, -HALF, HALF)
-    scratches = (((-0.5, -1.9), (0.3, -1.2)), ((0.7, -0.4), (1.9, 0.3)), ((-0.6, 0.1), (-0.1, 0.5)), ((1.2, -2.0), (2.1, -1.5)))
+    scratches = (((-0.4, -1.5), (0.3, -0.9)), ((0.6, -0.3), (1.5, 0.2)), ((-0.5, 0.1), (-0.1, 0.4)), ((1.0, -1.6), (1.7, -1.2)))
     shapes = (
         area((-HALF, -HALF, HALF, HALF), "#f4f1e8"),
         area((SHORE[0], -HALF, HALF, SHORE[1]), "ice"),
