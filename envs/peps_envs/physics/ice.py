@@ -3,7 +3,7 @@
 A propeller pushes the sled from the south-west corner to a goal in the north. It stands on a runner that touches the ground
 under gravity, so that Coulomb friction brakes it. Packed snow (friction 0.25) lies along the west and the north; the corner
 between is a frozen pond, whose ice has a fifth of that. Straight over the ice is quickest. Who believes that ice grips like snow
-expects the sled to lose another (0.25 - 0.05) g = 2 m/s^2 there, which is 4 cm in a control step of 0.2 s; on the snow it
+expects the sled to lose another (0.25 - 0.05) g = 2 m/s^2 there, which is 0.4 m/s in a control step of 0.2 s; on the snow it
 moves as expected.
 
 The snow lies on two planes that rise by 5 cm a metre from the pond's shore: MuJoCo's planes are infinite, and of planes
@@ -32,7 +32,7 @@ SLOPE = 0.05  # of the snow, up from the shore
 SINKS = 0.025  # m, what the ground gives way under the sled's weight: g d (1 - d) timeconst^2
 SUBSTEPS = 4  # of 0.05 s
 HORIZON = 100  # control steps
-SIGMA = 0.02  # m, of the sled's position
+WIDTH = (0.15, 0.15, 0.2, 0.2)  # sigma_p: half the sled's width, m, and 8 % of its top speed, m/s
 STEP_PRICE = 0.35
 PROGRESS = 2.0  # per metre that the distance to the goal shrinks
 GOAL_REWARD = 90.0
@@ -100,8 +100,13 @@ def observe(data: mjx.Data) -> Array:
 
 
 def position(data: mjx.Data) -> Array:
-    """What people compare: where the sled is, (2,) m."""
+    """Where the sled is, (2,) m."""
     return data.qpos[:2]
+
+
+def perceive(data: mjx.Data) -> Array:
+    """What people compare: where the sled is, m, and how fast and where to it slides, m/s, (4,)."""
+    return jnp.concatenate([data.qpos[:2], data.qvel[:2]])
 
 
 def distance(data: mjx.Data) -> Array:
@@ -125,9 +130,14 @@ def reward(data: mjx.Data, action: Array, after: mjx.Data, believed: mjx.Model) 
 def scene(compiled: mujoco.MjModel, data: mujoco.MjData) -> Scene:
     """The pond from above, its scratches, and the sled with a line that shows its velocity."""
     del compiled
-    place, velocity = np.asarray(data.qpos[:2]), np.asarray(data.qvel[:2])
-    ahead = np.clip(place + GLIDE * velocity, -HALF, HALF)
-    scratches = (((-0.4, -1.5), (0.3, -0.9)), ((0.6, -0.3), (1.5, 0.2)), ((-0.5, 0.1), (-0.1, 0.4)), ((1.0, -1.6), (1.7, -1.2)))
+    place = np.asarray(data.qpos[:2])
+    ahead = np.clip(place + GLIDE * np.asarray(data.qvel[:2]), -HALF, HALF)
+    scratches = (
+        ((-0.4, -1.5), (0.3, -0.9)),
+        ((0.6, -0.3), (1.5, 0.2)),
+        ((-0.5, 0.1), (-0.1, 0.4)),
+        ((1.0, -1.6), (1.7, -1.2)),
+    )
     shapes = (
         area((-HALF, -HALF, HALF, HALF), "#f4f1e8"),
         area((SHORE[0], -HALF, HALF, SHORE[1]), "ice"),
@@ -144,8 +154,8 @@ def domain() -> tuple[FromMjx, mjx.Model, dict[str, mjx.Model]]:
     environment = from_mjx(
         model(),
         reward,
-        position,
-        (SIGMA, SIGMA),
+        perceive,
+        WIDTH,
         horizon=HORIZON,
         substeps=SUBSTEPS,
         observe=observe,
