@@ -1,10 +1,9 @@
-"""A sled at a frozen pond: people think that ice grips like snow.
+"""A sled at black ice, which people take for wet asphalt.
 
-A propeller pushes the sled from the south-west corner to a goal in the north. It stands on a runner that touches the ground
-under gravity, so that Coulomb friction brakes it. Packed snow (friction 0.25) lies along the west and the north; the corner
-between is a frozen pond, whose ice has a fifth of that. Straight over the ice is quickest. Who believes that ice grips like snow
-expects the sled to lose another (0.25 - 0.05) g = 2 m/s^2 there, which is 0.4 m/s in a control step of 0.2 s; on the snow it
-moves as expected.
+A propeller pushes the sled from the south-west corner to a goal in the north-east. It stands on a runner that touches the
+ground under gravity, so that Coulomb friction brakes it. Packed snow (friction 0.25) lies along the west and the north; the
+ground between is iced over (0.05). Straight over the ice is quickest. Who takes it for wet asphalt (0.5) expects the sled to lose
+another (0.5 - 0.05) g = 4.4 m/s^2 there, which is 0.9 m/s in a control step of 0.2 s; on the snow it moves as expected.
 
 The snow lies on two planes that rise by 5 cm a metre from the pond's shore: MuJoCo's planes are infinite, and of planes
 that cut each other the higher one carries the sled. It is the ground's friction that decides (`priority`).
@@ -22,7 +21,8 @@ from peps_envs.bridges.from_mjx import FromMjx, from_mjx
 from peps_envs.scene import Circle, Polyline, Scene, area
 
 ICE = 0.05  # friction of wet ice
-SNOW = 0.25  # friction of packed snow, and what people expect of ice
+SNOW = 0.25  # friction of packed snow
+ASPHALT = 0.5  # friction of wet asphalt, for which people take the ice
 RADIUS = 0.15  # m, of the sled's runner, a ball that doesn't roll
 HALF = 2.0  # m, half the arena's width
 START = (-1.45, -1.3)  # m
@@ -32,15 +32,15 @@ SLOPE = 0.05  # of the snow, up from the shore
 SINKS = 0.025  # m, what the ground gives way under the sled's weight: g d (1 - d) timeconst^2
 SUBSTEPS = 4  # of 0.05 s
 HORIZON = 100  # control steps
-WIDTH = (0.15, 0.15, 0.2, 0.2)  # sigma_p: half the sled's width, m, and 8 % of its top speed, m/s
+WIDTH = (0.2, 0.2, 0.3, 0.3)  # sigma_p of place, m, and of velocity, m/s
 STEP_PRICE = 0.35
 PROGRESS = 2.0  # per metre that the distance to the goal shrinks
 GOAL_REWARD = 90.0
 TOP_SPEED = 2.5  # m/s, to which observed velocities are scaled
 GLIDE = 0.3  # s, for which the drawn line shows the sled's velocity
 
-# A ground as soft as `solimp` makes it keeps a sliding sled in touch; MuJoCo's friction lifts it from a stiffer one, so that it
-# hops at every other step. With fewer than 20 iterations of the line search the elliptic cone doesn't converge at rest.
+# MuJoCo's friction lifts what slides fast, so that it hops; a soft ground (`solimp`) and damping of z keep the sled in touch. With
+# fewer than 20 iterations of the line search the elliptic cone doesn't converge at rest.
 XML = """
 <mujoco model="ice">
   <option timestep="0.05" integrator="implicitfast" cone="elliptic" jacobian="dense" iterations="6" ls_iterations="20"
@@ -56,7 +56,7 @@ XML = """
     <body name="sled" pos="0 0 {height}">
       <joint name="x" type="slide" axis="1 0 0" damping="2.5" range="-{reach} {reach}" solreflimit="0.1 1"/>
       <joint name="y" type="slide" axis="0 1 0" damping="2.5" range="-{reach} {reach}" solreflimit="0.1 1"/>
-      <joint name="z" type="slide" axis="0 0 1"/>
+      <joint name="z" type="slide" axis="0 0 1" damping="30"/>
       <geom name="sled" type="sphere" size="{radius}" mass="1" contype="1" conaffinity="2"/>
     </body>
   </worldbody>
@@ -150,7 +150,7 @@ def scene(compiled: mujoco.MjModel, data: mujoco.MjData) -> Scene:
 
 
 def domain() -> tuple[FromMjx, mjx.Model, dict[str, mjx.Model]]:
-    """The task, its true model, and beliefs: `biased` takes ice for as rough as snow, `unbiased` knows it."""
+    """The task, its true model, and beliefs: `biased` takes ice for wet asphalt, `unbiased` knows it."""
     environment = from_mjx(
         model(),
         reward,
@@ -165,4 +165,4 @@ def domain() -> tuple[FromMjx, mjx.Model, dict[str, mjx.Model]]:
         scene=scene,
     )
     truth = environment.model(model())
-    return environment, truth, {"biased": environment.model(model(SNOW)), "unbiased": truth}
+    return environment, truth, {"biased": environment.model(model(ASPHALT)), "unbiased": truth}
