@@ -24,7 +24,7 @@ class Task(NamedTuple):
         return next(iter(self.beliefs))
 
 
-PHYSICS: tuple[str, ...] = ("reacher",)  # modules of `peps_envs.physics`
+PHYSICS: tuple[str, ...] = ("reacher", "ice")  # modules of `peps_envs.physics`
 _TASKS: dict[str, Callable[[], Task]] = {}
 
 
