@@ -24,7 +24,7 @@ class Task(NamedTuple):
         return next(iter(self.beliefs))
 
 
-PHYSICS: tuple[str, ...] = ()  # modules of `peps_envs.physics`
+PHYSICS: tuple[str, ...] = ("box",)  # modules of `peps_envs.physics`
 _TASKS: dict[str, Callable[[], Task]] = {}
 
 
