@@ -23,16 +23,17 @@ from mujoco import mjx
 from peps_envs.bridges.from_mjx import FromMjx, from_mjx
 from peps_envs.scene import Circle, Rectangle, Scene, area
 
-SIZE = (4.5, 4.5)  # m, of the room; it ends where the robot's rim would touch its outer walls
-START = (0.7, 1.35)  # m
-GOAL = (2.9, 0.9, 4.1, 1.8)  # m, the least x and y and the largest
-WALLS = ((1.95, 0.0, 2.55, 0.9), (1.95, 1.8, 2.55, 3.3))  # m, below the doorway and above it
-BOX = (2.25, 1.35)  # m, its centre at the start
-BOX_HALF = (0.375, 0.42)  # m, half its depth and width
+SIZE = (3.6, 3.7)  # m, of the room; it ends where the robot's rim would touch its outer walls
+START = (0.6, 1.2)  # m
+GOAL = (2.2, 0.0, 3.6, 1.65)  # m, the least x and y and the largest
+WALLS = ((1.4, 0.0, 1.8, 0.75), (1.4, 1.65, 1.8, 2.8))  # m, below the doorway and above it
+BOX = (1.6, 1.2)  # m, its centre at the start
+BOX_HALF = (0.3, 0.42)  # m, half its depth and width
 RADIUS = 0.3  # m, of the robot
 HEIGHT = 0.3  # m, half of what stands on the floor: nothing of it is seen from above
 
 FORCE = 60.0  # N, the most along each axis
+FULL_ACTION = 0.7  # from which on it is had: a policy that is squashed into [-1, 1] never reaches its ends
 DAMPING = 40.0  # N s/m, of the robot
 ROBOT_MASS = 2.0  # kg
 FRICTION = 0.3  # mu, between box and floor
@@ -48,7 +49,7 @@ HORIZON = 60  # steps
 PERCEPTION_WIDTH = 0.05  # m, sigma_p of the robot's x and y and of the box's x
 
 STEP_REWARD = -0.5
-PROGRESS_REWARD = 1.0  # per m that the distance to the goal's middle shrinks
+PROGRESS_REWARD = 1.0  # per m that the distance to the goal shrinks
 GOAL_REWARD = 100.0
 
 XML = """
@@ -73,8 +74,8 @@ XML = """
     </body>
   </worldbody>
   <actuator>
-    <motor joint="x" gear="{force}" ctrlrange="-1 1"/>
-    <motor joint="y" gear="{force}" ctrlrange="-1 1"/>
+    <general joint="x" gainprm="{gain}" ctrlrange="-1 1" forcerange="-{force} {force}"/>
+    <general joint="y" gainprm="{gain}" ctrlrange="-1 1" forcerange="-{force} {force}"/>
   </actuator>
 </mujoco>"""
 
@@ -100,6 +101,7 @@ def model(mass: float = TRUE_MASS) -> mujoco.MjModel:
             box_high=SIZE[0] - BOX_HALF[0],
             height=HEIGHT,
             force=FORCE,
+            gain=FORCE / FULL_ACTION,
         )
     )
 
@@ -128,16 +130,18 @@ def goal_reached(data: mjx.Data) -> Array:
 
 
 def reward(data: mjx.Data, action: Array, after: mjx.Data, judge: mjx.Model) -> Array:
-    """A price for every step, the distance to the goal's middle that was made good, and the goal: nobody prices masses."""
+    """A price for every step, what the distance to the goal shrank by, and the goal itself."""
     del action, judge
     progress = _distance(data) - _distance(after)
     return STEP_REWARD + PROGRESS_REWARD * progress + GOAL_REWARD * goal_reached(after)
 
 
 def _distance(data: mjx.Data) -> Array:
-    x0, y0, x1, y1 = GOAL
-    away = data.qpos[:2] - jnp.array([(x0 + x1) / 2, (y0 + y1) / 2])
-    return jnp.sqrt(jnp.sum(away**2) + 1e-6)  # smooth at its end
+    """How far it is to the goal as the crow flies, in m; 0 inside."""
+    low, high = jnp.array(GOAL[:2]), jnp.array(GOAL[2:])
+    place = data.qpos[:2]
+    away = jnp.maximum(jnp.maximum(low - place, place - high), 0.0)
+    return jnp.sqrt(jnp.sum(away**2))
 
 
 def scene(compiled: mujoco.MjModel, data: mujoco.MjData) -> Scene:
