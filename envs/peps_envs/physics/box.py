@@ -23,10 +23,10 @@ from mujoco import mjx
 from peps_envs.bridges.from_mjx import FromMjx, from_mjx
 from peps_envs.scene import Circle, Rectangle, Scene, area
 
-SIZE = (3.6, 3.7)  # m, of the room; it ends where the robot's rim would touch its outer walls
+SIZE = (3.6, 3.8)  # m, of the room; it ends where the robot's rim would touch its outer walls
 START = (0.6, 1.2)  # m
 GOAL = (2.2, 0.0, 3.6, 1.65)  # m, the least x and y and the largest
-WALLS = ((1.4, 0.0, 1.8, 0.75), (1.4, 1.65, 1.8, 2.8))  # m, below the doorway and above it
+WALLS = ((1.4, 0.0, 1.8, 0.75), (1.4, 1.65, 1.8, 2.9))  # m, below the doorway and above it
 BOX = (1.6, 1.2)  # m, its centre at the start
 BOX_HALF = (0.3, 0.42)  # m, half its depth and width
 RADIUS = 0.3  # m, of the robot
@@ -48,7 +48,7 @@ SUBSTEPS = 5  # a step of the environment takes 0.2 s
 HORIZON = 60  # steps
 PERCEPTION_WIDTH = 0.05  # m, sigma_p of the robot's x and y and of the box's x
 
-STEP_REWARD = -0.5
+STEP_REWARD = -0.6
 PROGRESS_REWARD = 1.0  # per m that the distance to the goal shrinks
 GOAL_REWARD = 100.0
 
