@@ -1,13 +1,14 @@
 """The size-weight illusion: a box that stands in a doorway is heavier than it looks.
 
-A robot, a disc on a floor that is seen from above, has to get to the other side of a wall. In the wall there is a doorway, in
-which a box stands: it can be pushed out of it, ahead, to the goal. Or one walks around the wall, which takes longer. People expect a
-small box to be light, so that pushing it be hardly slower than walking; in truth it brakes the robot at every step, which they
-see of robot and box alike.
+A robot, a disc on a floor that is seen from above, has to get past a wall. In the wall is a doorway, and in it stands
+a box: it can be pushed ahead and out of the way, to the goal. Or one walks around the wall, which takes longer. People
+expect a box of that size to be light, and pushing it to be hardly slower than walking. In truth it brakes the robot at
+every step, as they see of both.
 
 Dynamics. The robot is driven by forces of at most `FORCE` on its axes against a damping of `DAMPING`, so that it walks at
-FORCE / DAMPING = 1.5 m/s on either. The box, of mass m, slides along the doorway and is held back by the floor's dry friction
-mu m g, which follows from its mass. Pushed steadily it moves at (FORCE - mu m g) / DAMPING.
+FORCE / DAMPING = 1.5 m/s on either. The box, of mass m, slides along the doorway and is held back by the floor's dry
+friction mu m g, which follows from its mass. Pushed steadily it moves at (FORCE - mu m g) / DAMPING: 0.76 m/s, where people
+expect 1.35 m/s.
 
 Lengths are in m, masses in kg, times in s. x leads through the doorway, y along the wall.
 """
@@ -37,11 +38,12 @@ FULL_ACTION = 0.7  # from which on it is had: a policy that is squashed into [-1
 DAMPING = 40.0  # N s/m, of the robot
 ROBOT_MASS = 2.0  # kg
 FRICTION = 0.3  # mu, between box and floor
-GRAVITY = 9.81  # m/s^2
+GRAVITY = 9.81  # m/s^2, by which the box presses on the floor
 
 TRUE_MASS = 10.0  # kg, of the box
 LOOKS_LIGHT = 2.0  # kg, what is expected of a box of its size
 LOOKS_HEAVY = 20.0  # kg, the illusion the other way round: too heavy to be pushed at more than a crawl
+MISJUDGED = ("mass of the box, kg", TRUE_MASS, LOOKS_LIGHT)  # in truth, and as people take it
 
 TIMESTEP = 0.04  # s
 SUBSTEPS = 5  # a step of the environment takes 0.2 s
@@ -52,11 +54,10 @@ STEP_REWARD = -0.6
 PROGRESS_REWARD = 1.0  # per m that the distance to the goal shrinks
 GOAL_REWARD = 100.0
 
+# With fewer iterations of the line search, a heavy box that is held by friction creeps.
 XML = """
 <mujoco model="box">
-  <option timestep="{timestep}" integrator="implicitfast" cone="pyramidal" iterations="4" ls_iterations="6" gravity="0 0 0">
-    <flag eulerdamp="disable"/>
-  </option>
+  <option timestep="{timestep}" integrator="implicitfast" iterations="4" ls_iterations="20" gravity="0 0 0"/>
   <default>
     <geom condim="1" solref="{stiffness} 1"/>
     <joint type="slide" limited="true" solreflimit="{stiffness} 1" solreffriction="{stiffness} 1"/>
