@@ -45,7 +45,7 @@ def around(state):
 
 
 def walks(task):
-    """Of `push` and `around`: an episode's places, its return, l_H of each belief, its length in steps, and whether it arrived."""
+    """Of `push`, then of `around`: places, return, l_H of each belief, length in steps, and whether it arrived."""
     environment = task.environment
     beliefs = jax.tree.map(lambda *leaves: jnp.stack(leaves), *task.beliefs.values())
 

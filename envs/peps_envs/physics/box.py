@@ -5,9 +5,9 @@ a box: it can be pushed ahead and out of the way, to the goal. Or one walks arou
 expect a box of that size to be light, and pushing it to be hardly slower than walking. In truth it brakes the robot at
 every step, as they see of both.
 
-Dynamics. The robot is driven by forces of at most `FORCE` on its axes against a damping of `DAMPING`, so that it walks at
-FORCE / DAMPING = 1.5 m/s on either. The box, of mass m, slides along the doorway and is held back by the floor's dry
-friction mu m g, which follows from its mass. Pushed steadily it moves at (FORCE - mu m g) / DAMPING: 0.76 m/s, where people
+Dynamics. Forces of at most `FORCE` along each axis drive the robot against a damping of `DAMPING`, so that it walks at
+FORCE / DAMPING = 1.5 m/s. The box, of mass m, slides along the doorway and is held back by the floor's dry friction
+mu m g, which follows from its mass. Pushed steadily it moves at (FORCE - mu m g) / DAMPING: 0.76 m/s, where people
 expect 1.35 m/s.
 
 Lengths are in m, masses in kg, times in s. x leads through the doorway, y along the wall.
@@ -159,7 +159,7 @@ def scene(compiled: mujoco.MjModel, data: mujoco.MjData) -> Scene:
 def domain() -> tuple[FromMjx, mjx.Model, dict[str, mjx.Model]]:
     """The environment, its true model, and beliefs by their names.
 
-    `biased` expects the light box that it looks like, `heavy` one that hardly can be pushed, and `unbiased` knows its mass.
+    `biased` expects the light box that it looks like, `heavy` one that can hardly be pushed, `unbiased` knows its mass.
     """
     environment = from_mjx(
         model(),
