@@ -8,6 +8,8 @@ import importlib
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
+import jax
+
 from peps_envs import highway, navigation
 from peps_envs.environment import Environment
 
@@ -24,7 +26,7 @@ class Task(NamedTuple):
         return next(iter(self.beliefs))
 
 
-PHYSICS: tuple[str, ...] = ("reacher", "ice")  # modules of `peps_envs.physics`
+PHYSICS = ("box", "ice", "reacher")  # modules of `peps_envs.physics`
 _TASKS: dict[str, Callable[[], Task]] = {}
 
 
@@ -73,7 +75,12 @@ def _highway(domain: str) -> Callable[[], Task]:
 
 def _physics(module: str) -> Callable[[], Task]:
     # kept, because a compiled MuJoCo model equals itself alone; imported when it is asked for, because MuJoCo takes a second
-    return functools.cache(lambda: Task(*importlib.import_module(f"peps_envs.physics.{module}").domain()))
+    @functools.cache
+    def make() -> Task:
+        with jax.ensure_compile_time_eval():  # a task may be made while a training is traced
+            return Task(*importlib.import_module(f"peps_envs.physics.{module}").domain())
+
+    return make
 
 
 for _domain in navigation.DOMAINS:
