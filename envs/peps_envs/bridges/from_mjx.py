@@ -12,6 +12,7 @@ may touch, is part of the program, and models that differ in it are refused.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -22,11 +23,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from mujoco import mjx
 
 from peps_envs.bridges.simulated import SimulatedState, Simulator, Structure, check_flat
 from peps_envs.environment import Bounds, Box
 from peps_envs.scene import Scene
+
+with contextlib.redirect_stdout(None):  # it prints that Warp isn't there, which nobody needs
+    from mujoco import mjx
 
 # what MuJoCo derives from masses and sizes at compilation
 DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0", "tendon_invweight0", "actuator_acc0")

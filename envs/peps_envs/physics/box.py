@@ -19,9 +19,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from mujoco import mjx
 
-from peps_envs.bridges.from_mjx import FromMjx, from_mjx
+from peps_envs.bridges.from_mjx import FromMjx, from_mjx, mjx
 from peps_envs.scene import Circle, Rectangle, Scene, area
 
 SIZE = (3.6, 3.8)  # m, of the room; it ends where the robot's rim would touch its outer walls

@@ -15,9 +15,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from mujoco import mjx
 
-from peps_envs.bridges.from_mjx import FromMjx, from_mjx
+from peps_envs.bridges.from_mjx import FromMjx, from_mjx, mjx
 from peps_envs.scene import Circle, Polyline, Scene, area
 
 ICE = 0.05  # friction of wet ice

@@ -16,9 +16,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from mujoco import mjx
 
-from peps_envs.bridges.from_mjx import FromMjx, from_mjx
+from peps_envs.bridges.from_mjx import FromMjx, from_mjx, mjx
 from peps_envs.scene import Circle, Rectangle, Scene
 
 UPPER, FOREARM = 0.55, 0.45  # m, lengths of the links
