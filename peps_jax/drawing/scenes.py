@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH = 2.4  # inches, of a scene in a strip across
+CLEAR = "40"  # opacity of a ghost's colour, from 00 to ff
 COLOURS = 64  # of a small film's palette
 TITLE = 0.45  # inches between one scene and the next, for what is written there
 
@@ -63,18 +64,16 @@ def between(before: Any, after: Any, share: float) -> Any:
 
 
 def with_ghost(scene: Scene, expected: Scene) -> Scene:
-    """`scene`, and over it what is elsewhere in `expected`, as one sees through it."""
-    there = [_ghost(shape) for shape in expected.shapes if shape not in scene.shapes]
-    return dataclasses.replace(scene, shapes=(*scene.shapes, *there))
+    """`scene`, and over it, as one sees through it, what is elsewhere in `expected`."""
+    ghosts = [_ghost(shape) for shape in expected.shapes if shape not in scene.shapes]
+    return dataclasses.replace(scene, shapes=(*scene.shapes, *ghosts))
 
 
 def _ghost(shape: Shape) -> Shape:
     from matplotlib.colors import to_hex
 
-    clear = lambda alpha: to_hex(pictures.colour(shape.colour)) + alpha  # as CSS has it, too
-    if isinstance(shape, Rectangle | Circle):
-        return dataclasses.replace(shape, colour=clear("30"), outline="ink")
-    return dataclasses.replace(shape, colour=clear("80"))
+    clear = dataclasses.replace(shape, colour=to_hex(pictures.colour(shape.colour)) + CLEAR)  # as CSS has it, too
+    return dataclasses.replace(clear, outline="ink") if isinstance(shape, Rectangle | Circle) else clear
 
 
 def strips(clips: Mapping[str, Sequence[Scene]], labels: Sequence[str], note: str = "") -> Figure:
