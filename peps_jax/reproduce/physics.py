@@ -62,9 +62,9 @@ FACTORS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # of the true quantity, to be bel
 JUDGED = 20  # episodes that each of these humans judges
 AHEAD = 5  # control steps, over which the human's expectation is followed: over one it is hardly to be told from what happens
 MOMENTS = 5  # of an episode, in a strip
-FRAMES_PER_STEP, RATE = 3, 12  # pictures of the film for a control step, and for a second
-REST = 12  # pictures that the film's end stands still
-CLIP = 2.6  # inches, width of a clip in the film
+FRAMES_PER_STEP, RATE = 2, 10  # pictures of the film for a control step, and for a second
+REST = 10  # pictures that the film's end stands still
+CLIP = 2.4  # inches, width of a clip in the film
 
 _NOTE = """\
 {answers:,} answers. Arrive: seeds whose mode reaches the goal. IQM: interquartile mean over seeds, with a 95 % stratified
@@ -79,7 +79,7 @@ _BELIEFS = """\
 Explicability of the same policies for humans who believe other values: interquartile means over seeds with their 95 % intervals.
 PEPS learned from a human who believes the value in bold; the true one is in italics.
 """
-_GHOST = "see-through: where the human, who saw everything {ahead} steps before, expected things to be now"
+_GHOST = "pale: where the human, who saw everything {ahead} steps before and knows what was done since, expected things to be"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,7 +168,9 @@ def write(plan: Plan, folder: Path) -> list[Path]:
     ]
     lines += [line(TASKS, method, groups[method], plan.seeds * len(TASKS)) for method in METHODS]
     better, beliefs = improvements(groups, TASKS, BASELINES), _belief_lines(groups)
+    pictures = _pictures(plan, folder)
     text = [
+        *(f"![{_GHOST.format(ahead=AHEAD).capitalize()}]({path.name})\n" for path in pictures),
         markdown(head(paper=False), [cells(made, paper=False) for made in lines]),
         _NOTE.format(answers=plan.base.num_queries, episodes=plan.num_episodes, lam=plan.base.lam),
         _WAY,
@@ -180,6 +182,7 @@ def write(plan: Plan, folder: Path) -> list[Path]:
         "Probability that a training of PEPS scores higher than one of the baseline, with its 95 % interval:\n",
         markdown(["task", "baseline", "return", "explicability"], list(map(improvement_cells, better))),
         _BELIEFS,
+        "![Explicability over what the human believes](physics_beliefs.png)\n",
         *(_belief_table(task, beliefs) for task in TASKS),
     ]  # fmt: skip
     contents = {
@@ -189,7 +192,7 @@ def write(plan: Plan, folder: Path) -> list[Path]:
     }
     written = write_texts(folder, contents)
     written += write_picture(_belief_picture(beliefs), beliefs, folder, "physics_beliefs")
-    return [*written, *_pictures(plan, folder)]
+    return [*written, *pictures]
 
 
 def _way(task: str, lines: Sequence[Line], records: Mapping[str, Sequence[Record]]) -> list[str]:
