@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import peps_envs
-from peps_envs import Scene, physics
+from peps_envs import Scene, physics, registry
 from peps_jax.analysis import episodes
 from peps_jax.config import Config
 from peps_jax.drawing import scenes
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ABOUT = "tasks on MuJoCo models, of which the human believes another one"
-TASKS = tuple(f"mjx-{module}" for module in physics.MODULES)
+TASKS = tuple(f"mjx-{module}" for module in registry.PHYSICS)
 METHODS = ("peps", *BASELINES, "oracle")
 SHOWN = ("sac", "peps")  # in pictures, and judged by humans of other beliefs
 # Changes of the plan's settings that a task needs, by its name

@@ -9,6 +9,7 @@ A folder holds one configuration. Another one's trainings, or those of other cod
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
@@ -96,8 +97,14 @@ def code_of(environment: Environment) -> str | None:
     """
     parts = (type(environment), *filter(callable, vars(environment).values()))
     modules = {part.__module__ for part in parts if part.__module__.split(".")[0] in code.PACKAGES}
-    modules -= code.closure(*CODE)
+    modules -= _covered()
     return code.digest(*sorted(modules))[:16] if modules else None
+
+
+@functools.cache
+def _covered() -> frozenset[str]:
+    """Modules whose code `code_digest` is of."""
+    return frozenset(code.closure(*CODE))
 
 
 def code_digest() -> str:
