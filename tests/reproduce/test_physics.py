@@ -64,6 +64,9 @@ class Sled(Environment):
     def perception_width(self, params):
         return jnp.full(1, WIDTH)
 
+    def model(self, compiled):
+        return compiled
+
     def scene(self, state, params):
         goal = Rectangle(0.75, 0.0, 0.5, 0.4, "goal")
         return Scene((goal, Circle(float(state[0][0]), 0.0, 0.1, "agent")), (-1.0, 1.0, -0.2, 0.2))
@@ -74,7 +77,7 @@ def module(true: float, believed: float) -> types.ModuleType:
     made = types.ModuleType("sled")
     made.domain = lambda: (Sled(), Ice(true), {"biased": Ice(believed), "unbiased": Ice(true)})
     made.MISJUDGED = ("glide of the sled, m", true, believed)
-    made.believed = Ice
+    made.model = Ice
     return made
 
 

@@ -2,10 +2,10 @@
 
 A module for each, with its models' XML and
 
-    domain()         the environment, its true model, and beliefs by name, of which the first one is the default
-    MISJUDGED        what people misjudge, in words with its unit; what it is; and what they take it for, such as
-                     ("mass of the box, kg", 5.0, 1.0)
-    believed(value)  the belief that it is so much: the environment's parameters, of a model that was compiled with it
+    MISJUDGED      what people misjudge, in words with its unit; what it is; and what they take it for, such as
+                   ("mass of the box, kg", 5.0, 1.0)
+    model(value)   MuJoCo's model in which it is so much, compiled; the true one by default
+    domain()       the environment, its true parameters, and beliefs by name, of which the first one is the default
 
 The registry names them (`PHYSICS`) and imports one when its task is made, because MuJoCo and MJX take a second.
 """
@@ -15,6 +15,8 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
+
+from peps_envs import registry
 
 
 class Misjudged(NamedTuple):
@@ -29,4 +31,5 @@ class Misjudged(NamedTuple):
 def misjudged(task: str) -> Misjudged:
     """What the human of `task` ("mjx-box") is wrong about."""
     module = importlib.import_module(f"{__name__}.{task.removeprefix('mjx-')}")
-    return Misjudged(*module.MISJUDGED, module.believed)
+    environment = registry.make(task).environment
+    return Misjudged(*module.MISJUDGED, lambda value: environment.model(module.model(value)))
