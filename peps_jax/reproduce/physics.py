@@ -274,7 +274,10 @@ def _pictures(plan: Plan, folder: Path) -> list[Path]:
     clips = {caption: _strip(training.view, plan.record(training)) for caption, training in typical.items()}
     figure = scenes.strips_across(clips, _GHOST.format(ahead=AHEAD))
     files.write_with(strips, lambda path: figure.savefig(path, dpi=150))
-    moving = {caption: _film(training.view, plan.record(training)) for caption, training in typical.items()}
+    moving = {
+        caption.replace(": ", "\n"): _film(training.view, plan.record(training))
+        for caption, training in typical.items()
+    }
     longest = max(map(len, moving.values())) + REST
     moving = {caption: [*clip, *[clip[-1]] * (longest - len(clip))] for caption, clip in moving.items()}
     files.write_with(film, lambda path: scenes.small_film(moving, path, RATE, columns=len(SHOWN), width=CLIP))
