@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 ABOUT = "tasks on MuJoCo models, of which the human believes another one"
 TASKS = tuple(f"mjx-{module}" for module in registry.PHYSICS)
-METHODS = ("peps", *BASELINES, "oracle")
+METHODS = ("peps", *BASELINES, "oracle", "darc")
 SHOWN = ("sac", "peps")  # in pictures, and judged by humans of other beliefs
 # Changes of the plan's settings that a task needs, by its name
 SETTINGS: dict[str, dict[str, Any]] = {}
@@ -68,8 +68,8 @@ CLIP = 2.4  # inches, width of a clip in the film
 
 _NOTE = """\
 {answers:,} answers. Arrive: seeds whose mode reaches the goal. IQM: interquartile mean over seeds, with a 95 % stratified
-bootstrap interval; {episodes} episodes a seed by the policy's mode, "sampled" by its samples. The oracle is told ℓ_H + r_H in r̂'s
-place; λ = {lam:g} for it and for PEPS.
+bootstrap interval; {episodes} episodes a seed by the policy's mode, "sampled" by its samples. Two yardsticks ask nobody: the oracle
+is told ℓ_H + r_H in r̂'s place, DARC may step the believed model; λ = {lam:g} for them and for PEPS.
 """
 _WAY = """\
 How far it is from SAC's to the oracle's explicability, the share of it that PEPS covers, whether the intervals of PEPS and SAC are

@@ -222,7 +222,7 @@ def test_without_mujoco_it_is_one_line(tmp_path, capsys, tiny, monkeypatch):
 FILES = {"physics.md", "physics.csv", "physics_improvement.csv", "physics.png", "physics.gif"} | {
     f"physics_beliefs.{kind}" for kind in ("csv", "png", "pdf")
 }
-VALUE = {"peps": 90.0, "sac": 50.0, "oracle": 100.0, "drlhp": 10.0, "policy_shaping": 20.0}
+VALUE = {"peps": 90.0, "sac": 50.0, "oracle": 100.0, "drlhp": 10.0, "policy_shaping": 20.0, "darc": 95.0}
 
 
 def kept(folder, base, tiny, seen, methods=physics.METHODS):
@@ -282,7 +282,7 @@ def test_intervals_that_overlap_are_not_apart(tmp_path, tiny, seen, monkeypatch)
 def test_trainings_from_end_to_end(tmp_path, tiny, seen, monkeypatch):
     """PEPS and SAC are trained: without a map r-hat has no heat, and an episode is kept."""
     monkeypatch.setattr(physics, "FACTORS", (1.0,))
-    kept(tmp_path, tiny, tiny, {}, methods=("drlhp", "policy_shaping", "oracle"))
+    kept(tmp_path, tiny, tiny, {}, methods=("drlhp", "policy_shaping", "oracle", "darc"))
     assert call(tmp_path, tiny) == 0
     made = Plan(tiny, 3, EPISODES)
     wanted = physics.needs(made)
