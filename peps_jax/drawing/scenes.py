@@ -23,7 +23,7 @@ from peps_jax.preferences.data import Segments
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-WIDTH = 2.4  # inches, of a scene in a strip across
+WIDTH = 2.0  # inches, of a scene in a strip across
 CLEAR = "40"  # opacity of a ghost's colour, from 00 to ff
 COLOURS = 64  # of a small film's palette
 TITLE = 0.45  # inches between one scene and the next, for what is written there
