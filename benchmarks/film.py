@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from peps_envs.navigation import NavigationState
 from peps_envs.scene import Polyline, Text
 from peps_jax import Config, Evaluation, evaluate, train
 from peps_jax.drawing.panels import colour_of
-from peps_jax.drawing.scenes import film, scenes_of
+from peps_jax.drawing.scenes import scenes_of, small_film
 
 ROOT = Path(__file__).parents[1]
 ENV = "nav-d4"
@@ -32,7 +31,6 @@ NAMES = {"goal": "goal", "pit": "pit", "ice": "ice", "firm sand": "sand"}  # wri
 FRAMES_PER_STEP, RATE = 3, 9  # moments of a step, and of a second
 REST = 12  # moments that the end stands still
 WIDTH = 2.4  # inches, of one clip
-COLOURS = 64  # of the GIF's palette
 
 
 def labelled(scene: Scene) -> Scene:
@@ -70,21 +68,6 @@ def clips(config: Config) -> dict[str, Sequence[Scene]]:
     return made
 
 
-def smaller(source: Path, target: Path) -> None:
-    """The GIF `source` without its white margin, and with one palette of `COLOURS` for all its pictures."""
-    from PIL import Image, ImageChops, ImageSequence
-
-    with Image.open(source) as whole:
-        pictures = [picture.convert("RGB") for picture in ImageSequence.Iterator(whole)]
-        times = [picture.info.get("duration", whole.info["duration"]) for picture in ImageSequence.Iterator(whole)]
-    white = Image.new("RGB", pictures[0].size, "white")
-    inside = ImageChops.difference(pictures[0], white).point(lambda part: 255 * (part > 8)).getbbox()
-    pictures = [picture.crop(inside) for picture in pictures]
-    palette = pictures[-1].quantize(COLOURS)
-    first, *rest = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
-    first.save(target, save_all=True, append_images=rest, duration=times, loop=0, optimize=True)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--steps", type=int, default=Config().total_steps, help="environment steps of a training")
@@ -94,9 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     made = clips(Config(env=ENV, seed=given.seed, total_steps=given.steps))
     longest = max(map(len, made.values())) + REST
     made = {title: [*clip, *[clip[-1]] * (longest - len(clip))] for title, clip in made.items()}
-    with tempfile.TemporaryDirectory() as folder:
-        film(made, Path(folder) / "film.gif", RATE, across=True, width=WIDTH)
-        smaller(Path(folder) / "film.gif", given.out)
+    small_film(made, given.out, RATE, columns=len(made), width=WIDTH)
 
 
 if __name__ == "__main__":

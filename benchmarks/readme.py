@@ -44,7 +44,7 @@ def embedded(text: str, page: Path) -> str:
 def measured(file: str, page: Path) -> str:
     """The content of `file`, with the pictures beside it named as `page` sees them."""
     folder = Path(os.path.relpath((ROOT / file).parent, page.parent)).as_posix()
-    return re.sub(r"\]\((?=[^)/]+\.png\))", f"]({folder}/", (ROOT / file).read_text(encoding="utf-8"))
+    return re.sub(r"\]\((?=[^)/]+\.(?:png|gif)\))", f"]({folder}/", (ROOT / file).read_text(encoding="utf-8"))
 
 
 def headline(file: str) -> str:

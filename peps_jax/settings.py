@@ -17,7 +17,7 @@ from jax import Array
 import peps_envs
 from peps_jax.config import Config, Problem
 
-_static = lambda: struct.field(pytree_node=False)
+_static = lambda **default: struct.field(pytree_node=False, **default)
 
 
 @struct.dataclass
@@ -53,8 +53,8 @@ class RolloutSettings:
     num_envs: int = _static()
     length: int = _static()  # steps of each environment in a round
     hold_steps: int = _static()  # for which a random action is held
-    imagines: bool = _static()  # whether what the human imagines is kept, for a method that learns from it
     exploration: Array  # share of the steps with random actions
+    imagines: bool = _static(default=False)  # whether what the human imagines is kept, for a method that learns from it
 
 
 @struct.dataclass

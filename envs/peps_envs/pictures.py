@@ -20,6 +20,7 @@ ROLES = {  # the colours of what a scene shows, see `peps_envs.scene`; CSS knows
     "pit": "#9c5a33",
     "goal": "#57a773",
     "ice": "#a9d3f0",
+    "snow": "#f4f1e8",
     "sand": "#f6e3a1",
     "firm sand": "#dfb94f",
     "road": "#d9d9d6",

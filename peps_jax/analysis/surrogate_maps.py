@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from peps_envs.navigation import NavigationState
+from peps_envs.navigation import Navigation, NavigationState
 from peps_jax.config import Problem
 from peps_jax.learning import surrogate
 from peps_jax.learning.surrogate import SurrogateState
@@ -18,6 +18,11 @@ from peps_jax.settings import SurrogateSettings
 from peps_jax.train import Result
 
 DIRECTIONS = 16  # of full steps, over which the heat maps take the mean
+
+
+def has_map(result: Result) -> bool:
+    """Whether what was trained lies on a navigation domain's map, over which there is something to see."""
+    return isinstance(result.training.problem.environment, Navigation)
 
 
 def surrogate_values(result: Result, resolution: int = 61) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

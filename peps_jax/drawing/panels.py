@@ -26,14 +26,18 @@ COLOURS = ("#c2255c", "#1c6dd0", "#e8890c", "#2f9e78", "#7048b6", "#5c6770")
 DOTS = 200  # per inch
 
 
-def panels_of(rows: int, columns: int, width: float, height: float) -> tuple[Figure, np.ndarray]:
-    """A figure of panels `width` x `height` inches. Without pyplot: no display is asked for, and nothing is global."""
+def panels_of(rows: int, columns: int, width: float, height: float | Sequence[float]) -> tuple[Figure, np.ndarray]:
+    """A figure of panels `width` x `height` inches, or with a height for each row.
+
+    Without pyplot: no display is asked for, and nothing is global.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(columns * width, rows * height), layout="constrained", facecolor="white")
+    heights = np.broadcast_to(height, rows)
+    figure = Figure(figsize=(columns * width, float(heights.sum())), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns, squeeze=False)
+    return figure, figure.subplots(rows, columns, squeeze=False, height_ratios=heights)
 
 
 def tidy(axes: Axes) -> None:

@@ -62,7 +62,8 @@ def over_devices(
         mapped = jax.shard_map(on_device, mesh=mesh, in_specs=specs, out_specs=P("runs"), check_vma=False)
         return mapped(*arguments)
 
-    return jax.jit(on_all, donate_argnums=donate)
+    # said once more, because arrays without entries, such as a model's activations that has none, come out undivided
+    return jax.jit(on_all, donate_argnums=donate, out_shardings=sharding(devices))
 
 
 def compile_over_devices(function: Callable[[Any], Any], trees: Sequence[Any]) -> tuple[Any, Any]:

@@ -83,7 +83,10 @@ def written(config: Config, *more: Any) -> str | None:
     if any(part.__module__.split(".")[0] not in ("peps_jax", "peps_envs") for part in ours):
         return None
     leaves, tree = jax.tree.flatten(one)
-    return repr([tree, [(jnp.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves], *more])
+    text = repr([tree, [(jnp.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves], *more])
+    return (
+        None if " at 0x" in text else text
+    )  # an object, such as a compiled model, that no other process can tell by that
 
 
 def stack(configs: Sequence[Config]) -> Config:

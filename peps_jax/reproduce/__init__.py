@@ -8,5 +8,5 @@ summary  what the records of several trainings come to: estimates, a line of a t
 ways     names for the ways through the navigation domains
 driving  the driving study, of which Figure 3 tells
 
-Each result is a module with `needs` and `write`: table1, figure1, figure2, figure3, frontier, queries, ablations.
+Each result is a module with `needs` and `write`: table1, figure1, figure2, figure3, frontier, queries, ablations, physics.
 """

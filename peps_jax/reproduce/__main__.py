@@ -29,6 +29,7 @@ from peps_jax.reproduce import (
     figure2,
     figure3,
     frontier,
+    physics,
     queries,
     table1,
     table1_many,
@@ -71,6 +72,7 @@ RESULTS: dict[str, Result] = {
     "bias": bias,
     "queries": queries,
     "ablations": ablations,
+    "physics": physics,
 }
 GROUPS = {"paper": ("table1", "figure1", "figure2"), "all": tuple(RESULTS)}
 

@@ -17,14 +17,14 @@ import numpy as np
 
 import peps_envs
 from peps_jax.analysis import navigation_planner
-from peps_jax.analysis.surrogate_maps import surrogate_values
+from peps_jax.analysis.surrogate_maps import has_map, surrogate_values
 from peps_jax.config import Config
 from peps_jax.evaluate import evaluate
 from peps_jax.execution import batches
 from peps_jax.execution.program import FinishedRun, Times
 from peps_jax.execution.progress import Display
 from peps_jax.execution.waiting import Reminder
-from peps_jax.reproduce.store import ROUTES, Record, Store, episodes, settings_of
+from peps_jax.reproduce.store import ROUTES, Record, Store, code_of, episodes, settings_of
 from peps_jax.train import check
 
 DOMAINS = ("nav-d1", "nav-d2", "nav-d3", "nav-d4")
@@ -64,17 +64,31 @@ class Alone(Need, Protocol):
         """The record."""
 
 
+class View(Protocol):
+    """What a figure needs of a finished training beside its scores. Equal ones look at the same."""
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """What decides its numbers."""
+
+    def of(self, run: FinishedRun) -> dict[str, np.ndarray]:
+        """What is kept, by its names."""
+
+
 class Training(NamedTuple):
     """A training by its name."""
 
     name: str
     config: Config
     bias: float = 1.0  # strength of the belief's error
+    view: View | None = None
 
     @property
     def recipe(self) -> dict[str, Any]:
         """What decides its numbers; a belief follows from its environment and the strength of its error."""
-        return settings_of(self.config.replace(belief=None)) | ({} if self.bias == 1 else {"bias": self.bias})
+        told = settings_of(self.config.replace(belief=None)) | ({} if self.bias == 1 else {"bias": self.bias})
+        own = code_of(peps_envs.make(self.config.env).environment)
+        return told | ({} if own is None else {"code": own}) | ({} if self.view is None else {"view": self.view.recipe})
 
     def of(self, arrays: Mapping[str, np.ndarray]) -> Record:
         return Record.of(arrays)
@@ -146,7 +160,9 @@ class Plan:
         self.base, self.seeds, self.num_episodes = base, seeds, num_episodes
         self._records: dict[str, Any] = {}
 
-    def training(self, env: str, method: str, seed: int, bias: float = 1.0, **changes: Any) -> Training:
+    def training(
+        self, env: str, method: str, seed: int, bias: float = 1.0, view: View | None = None, **changes: Any
+    ) -> Training:
         """The training of `method` in `env` with `changes` of the plan's settings; changes that change nothing don't count.
 
         `bias` is the strength of the belief's error, as in `believed`.
@@ -156,7 +172,7 @@ class Plan:
         config = self.base.replace(env=env, method=method, seed=seed, **changes)
         if bias != 1:
             config = config.replace(belief=believed(env, bias))
-        return Training(f"{env}-{method}{told}{_told(bias)}-seed{seed}", config, bias)
+        return Training(f"{env}-{method}{told}{_told(bias)}-seed{seed}", config, bias, view)
 
     def trainings(self, env: str, method: str, seeds: int | None = None, **changes: Any) -> list[Training]:
         """The trainings of the first `seeds` seeds; of all by default."""
@@ -223,7 +239,7 @@ class Plan:
         def keep_batch(done: batches.Batch, finished: Sequence[FinishedRun], times: Times) -> None:
             seconds = (times.run + times.evaluate) / len(done.runs)
             for place, run in zip(done.runs, finished, strict=True):
-                keep(trainings[place], _reduce(run, self.num_episodes, seconds))
+                keep(trainings[place], _reduce(run, self.num_episodes, seconds, trainings[place].view))
 
         if trainings:
             configs = [training.config for training in trainings]
@@ -232,14 +248,14 @@ class Plan:
                 batches.run(configs, divided, self.num_episodes, display)
 
 
-def _reduce(run: FinishedRun, num_episodes: int, seconds: float) -> Record:
-    """What is kept of a finished training, its samples' evaluation and r-hat over the map among it."""
+def _reduce(run: FinishedRun, num_episodes: int, seconds: float, view: View | None) -> Record:
+    """What is kept of a finished training, its samples' evaluation and, where there is a map, r-hat over it among it."""
     mode = episodes(run.evaluation)
     problem = run.training.problem
     imagined = evaluate(run, num_episodes, problem=problem.replace(params=problem.belief))
     mode["believed_return"] = np.asarray(imagined.human_return, np.float32)
     heat = {}
-    if run.surrogate is not None:
+    if run.surrogate is not None and has_map(run):
         heat = dict(zip(("learned", "true", "free"), surrogate_values(run), strict=True))
     return Record(
         mode=mode,
@@ -248,6 +264,7 @@ def _reduce(run: FinishedRun, num_episodes: int, seconds: float) -> Record:
         heat=heat,
         failed=run.failed,
         seconds=seconds,
+        seen={} if view is None else view.of(run),
     )
 
 

@@ -9,14 +9,17 @@ A folder holds one configuration. Another one's trainings, or those of other cod
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from peps_envs import Environment
 from peps_jax.analysis.surrogate_maps import rank_correlation
 from peps_jax.config import Config
 from peps_jax.evaluate import Evaluation
@@ -38,9 +41,10 @@ class Record(NamedTuple):
     mode: dict[str, np.ndarray]
     sampled: dict[str, np.ndarray]  # the same of its samples; nothing of a plan
     routes: np.ndarray  # (ROUTES, horizon + 1, 2) positions; the last one is repeated after the end
-    heat: dict[str, np.ndarray]  # (rows, columns) each: learned, true, free; nothing without r-hat
+    heat: dict[str, np.ndarray]  # (rows, columns) each: learned, true, free; nothing without r-hat or without a map
     failed: bool  # something that was learned or evaluated isn't finite
     seconds: float  # of wall clock
+    seen: Mapping[str, np.ndarray] = MappingProxyType({})  # by the training's view; nothing without one
 
     def mean(self, name: str, sampled: bool = False) -> float:
         """Mean over episodes."""
@@ -54,7 +58,7 @@ class Record(NamedTuple):
     def arrays(self) -> dict[str, np.ndarray]:
         """What a file holds of it."""
         arrays = {"routes": self.routes, "failed": np.array(self.failed), "seconds": np.array(self.seconds)}
-        for part in ("mode", "sampled", "heat"):
+        for part in ("mode", "sampled", "heat", "seen"):
             arrays |= {f"{part}/{key}": values for key, values in getattr(self, part).items()}
         return arrays
 
@@ -65,7 +69,7 @@ class Record(NamedTuple):
             key.partition("/")[2]: value for key, value in arrays.items() if key.startswith(f"{name}/")
         }
         failed, seconds = bool(arrays["failed"]), float(arrays["seconds"])
-        return cls(part("mode"), part("sampled"), arrays["routes"], part("heat"), failed, seconds)
+        return cls(part("mode"), part("sampled"), arrays["routes"], part("heat"), failed, seconds, part("seen"))
 
 
 def episodes(evaluation: Evaluation) -> dict[str, np.ndarray]:
@@ -84,6 +88,23 @@ def episodes(evaluation: Evaluation) -> dict[str, np.ndarray]:
 def settings_of(config: Config) -> dict[str, Any]:
     """Every setting, as JSON knows it."""
     return files.plain({field.name: getattr(config, field.name) for field in dataclasses.fields(Config)})
+
+
+def code_of(environment: Environment) -> str | None:
+    """A short name for an environment's code, where that of training and evaluation doesn't hold it; None where it does.
+
+    A task's module may be imported when the task is made, which nothing tells that reads imports.
+    """
+    parts = (type(environment), *filter(callable, vars(environment).values()))
+    modules = {part.__module__ for part in parts if part.__module__.split(".")[0] in code.PACKAGES}
+    modules -= _covered()
+    return code.digest(*sorted(modules))[:16] if modules else None
+
+
+@functools.cache
+def _covered() -> frozenset[str]:
+    """Modules whose code `code_digest` is of."""
+    return frozenset(code.closure(*CODE))
 
 
 def code_digest() -> str:

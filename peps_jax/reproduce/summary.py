@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from peps_jax.analysis.intervals import Estimate, estimate, interquartile_mean
+from peps_jax.analysis.intervals import Estimate, estimate, interquartile_mean, probability_of_improvement
 from peps_jax.drawing.panels import save
 from peps_jax.reproduce.store import Record
 from peps_jax.storage import files
@@ -88,6 +88,45 @@ def line(domains: Sequence[str], what: str, groups: Sequence[Sequence[Record]], 
     made |= {"arrived": sum(rate > 0.5 for rate in rates), "trained": trained, "goal_rate": mean(rates)}
     made |= {f"sampled_{score}": mean([record.mean(score, sampled=True) for record in good]) for score in SCORES}
     return made
+
+
+def improvements(
+    groups: Mapping[str, Sequence[Sequence[Record]]], domains: Sequence[str], baselines: Sequence[str]
+) -> list[Line]:
+    """How probably a training of PEPS scores higher than one of each baseline: in each of `domains`, and over all.
+
+    `groups` are records by method, and of each method by domain.
+    """
+    lines = []
+    for places, domain in (*(([place], domain) for place, domain in enumerate(domains)), (range(len(domains)), "all")):
+        for baseline in baselines:
+            made: Line = {"domain": domain, "baseline": baseline}
+            for score in SCORES:
+                ours, theirs = (
+                    [[record.mean(score) for record in groups[method][place]] for place in places]
+                    for method in ("peps", baseline)
+                )
+                made |= in_columns(score, interval(ours, theirs, statistic=probability_of_improvement))
+            lines.append(made)
+    return lines
+
+
+def improvement_cells(made: Mapping[str, Any]) -> list[str]:
+    """A line of `improvements` as a table shows it."""
+    shown = [with_interval(from_columns(made, score), 2) for score in SCORES]
+    return [made["domain"], TITLES[made["baseline"]], *shown]
+
+
+def way_covered(ours: Sequence[Record], base: Sequence[Record], best: float) -> tuple[float, float]:
+    """How far it is from `base` to `best` in explicability, and the share of it that `ours` covers; nan where there is no way."""
+    reached, from_where = (mean([record.mean("explicability") for record in records]) for records in (ours, base))
+    gap = best - from_where
+    return gap, (reached - from_where) / gap if gap > 0 else math.nan
+
+
+def percent(share: float) -> str:
+    """A share in a table; a dash where there is none."""
+    return f"{share:.0%}" if math.isfinite(share) else "–"
 
 
 def decimal(value: float | None, digits: int = 1) -> str:

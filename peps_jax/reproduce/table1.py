@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from peps_jax import methods
-from peps_jax.analysis.intervals import probability_of_improvement
 from peps_jax.reproduce import ways
 from peps_jax.reproduce.plan import BASELINES, DOMAINS, Need, Plan, Training
 from peps_jax.reproduce.store import Record
 from peps_jax.reproduce.summary import (
     SCORES,
-    TITLES,
     Line,
     cells,
     decimal,
-    from_columns,
     head,
-    in_columns,
-    interval,
+    improvement_cells,
+    improvements,
     line,
     mean,
-    with_interval,
+    percent,
+    way_covered,
     write_texts,
 )
 from peps_jax.storage.tables import csv_bytes, latex, markdown
@@ -94,7 +90,7 @@ def write(plan: Plan, folder: Path, many: bool = False) -> list[Path]:
             lines.append(made)
         lines += [_planner_line(plan, domain, objective) for objective in ("return", "peps", "human")]
     lines += [line(DOMAINS, method, groups[method], plan.seeds * len(DOMAINS)) for method in ROWS]
-    improvements = _improvements(groups)
+    better = improvements(groups, DOMAINS, BASELINES)
     names, shown = [*head(paper=True), "way"], [[*cells(made, paper=True), made.get("way", "")] for made in lines]
     text = [
         markdown(names, shown),
@@ -104,7 +100,7 @@ def write(plan: Plan, folder: Path, many: bool = False) -> list[Path]:
             answers=plan.base.num_queries * (MANY if many else 1),
         ),
         "Probability that a training of PEPS scores higher than one of the baseline, with its 95 % interval:\n",
-        markdown(["domain", "baseline", *SCORES], [_improvement_cells(one) for one in improvements]),
+        markdown(["domain", "baseline", *SCORES], [improvement_cells(one) for one in better]),
         "Share of the way from SAC's to the planner's explicability, and rank correlation of r̂ and ℓ_H + r_H over the map, means\n"
         "over seeds:\n",
         markdown(
@@ -120,39 +116,16 @@ def write(plan: Plan, folder: Path, many: bool = False) -> list[Path]:
         f"table1{suffix}.md": "\n".join(text),
         f"table1{suffix}.csv": csv_bytes(lines),
         f"table1{suffix}.tex": latex(names, shown),
-        f"improvement{suffix}.csv": csv_bytes(improvements),
+        f"improvement{suffix}.csv": csv_bytes(better),
     }
     return write_texts(folder, contents)
 
 
-def _improvements(groups: Mapping[str, Sequence[Sequence[Record]]]) -> list[Line]:
-    """PEPS against each baseline, in each domain and over all."""
-    lines = []
-    for places, domain in (*(([place], domain) for place, domain in enumerate(DOMAINS)), (range(len(DOMAINS)), "all")):
-        for baseline in BASELINES:
-            made: Line = {"domain": domain, "baseline": baseline}
-            for score in SCORES:
-                ours, theirs = (
-                    [[record.mean(score) for record in groups[method][place]] for place in places]
-                    for method in ("peps", baseline)
-                )
-                made |= in_columns(score, interval(ours, theirs, statistic=probability_of_improvement))
-            lines.append(made)
-    return lines
-
-
-def _improvement_cells(made: Mapping[str, Any]) -> list[str]:
-    shown = [with_interval(from_columns(made, score), 2) for score in SCORES]
-    return [made["domain"], TITLES[made["baseline"]], *shown]
-
-
 def _covered(plan: Plan, domain: str, ours: Sequence[Record], base: Sequence[Record]) -> list[str]:
     best = plan.record(plan.planned(domain, "peps")).mean("explicability")
-    reached, from_where = (mean([record.mean("explicability") for record in records]) for records in (ours, base))
-    gap = best - from_where
-    share = (reached - from_where) / gap if gap > 0 else np.nan
+    gap, share = way_covered(ours, base, best)
     agreement = mean([record.rank_correlation() for record in ours])
-    return [domain, decimal(gap), f"{share:.0%}" if np.isfinite(share) else "–", decimal(agreement, 2)]
+    return [domain, decimal(gap), percent(share), decimal(agreement, 2)]
 
 
 def _as_in_the_paper(domain: str, method: str, records: Sequence[Record]) -> str:

@@ -11,18 +11,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from peps_envs import Scene
-from peps_envs.navigation import Navigation
 from peps_jax import methods
-from peps_jax.analysis.surrogate_maps import rank_correlation, surrogate_values
+from peps_jax.analysis import episodes
+from peps_jax.analysis.surrogate_maps import has_map, rank_correlation, surrogate_values
 from peps_jax.drawing import scenes
 from peps_jax.drawing.navigation_map import draw_heat, draw_map, draw_route, draw_start
 from peps_jax.drawing.panels import INK, QUIET, colour_of, panels_of, save, tidy
 from peps_jax.sweep.results import PICTURES, Row
-from peps_jax.train import Result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -158,10 +156,6 @@ def _frontier_line(axes: Axes, points: Sequence[Sequence[Row]], method: str) -> 
 # --- what the agents do ---------------------------------------------------------------------------------------------------
 
 
-def _navigates(row: Row) -> bool:
-    return isinstance(row.run.training.problem.environment, Navigation)
-
-
 def routes(rows: Sequence[Row], episodes: int = 3) -> Figure | None:
     """What the agents do, a row for each environment and a column for each method and lambda.
 
@@ -191,7 +185,7 @@ def routes(rows: Sequence[Row], episodes: int = 3) -> Figure | None:
 
 def _panel(axes: Axes, members: Sequence[Row], episodes: int) -> None:
     """What one method does in one environment, whichever way that can be shown."""
-    if _navigates(members[0]):
+    if has_map(members[0].run):
         _routes_panel(axes, members, episodes)
         return
     shown = _moments(members[0])
@@ -221,31 +215,10 @@ def _moments(row: Row) -> dict[str, Scene]:
     start, _ = environment.reset(jax.random.key(0), params)
     if environment.scene(start, params) is None:
         return {}
-    states, length = jax.tree.map(np.asarray, _episode(row.run, jax.random.key(0)))
-    times = np.linspace(0, int(length), MOMENTS + 1)[1:].round()
-    shown = scenes.scenes_of(environment, params, states, times)
+    seen = jax.tree.map(np.asarray, episodes.episode(row.run, jax.random.key(0)))
+    times = np.linspace(0, int(seen.length), MOMENTS + 1)[1:].round()
+    shown = scenes.scenes_of(environment, params, seen.states, times)
     return {f"step {time:.0f}": scene for time, scene in zip(times, shown, strict=True)}
-
-
-@jax.jit
-def _episode(result: Result, key: Any) -> tuple[Any, Any]:
-    """States (horizon + 1, ...) of an episode of `result`, the last one repeated after its end, and the episode's length."""
-    environment, params = result.training.problem.environment, result.training.problem.params
-    policy = result.policy()
-
-    def move(carry: Any, key: Any) -> tuple[Any, Any]:
-        state, observation, alive = carry
-        after = environment.step(key, state, policy(observation, None)[0], params)
-        hold = lambda new, old: jax.tree.map(lambda new, old: jnp.where(alive, new, old), new, old)
-        state, observation = hold((after.state, after.observation), (state, observation))
-        return (state, observation, alive & ~(after.terminated | after.truncated)), (state, alive)
-
-    key_start, key_moves = jax.random.split(key)
-    state, observation = environment.reset(key_start, params)
-    keys = jax.random.split(key_moves, environment.horizon)
-    _, (later, alive) = jax.lax.scan(move, (state, observation, jnp.ones((), bool)), keys)
-    states = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), state, later)
-    return states, jnp.sum(alive)
 
 
 def _moments_panel(axes: Axes, shown: Mapping[str, Scene]) -> None:
@@ -277,7 +250,7 @@ def _perceived_panel(axes: Axes, members: Sequence[Row], episodes: int) -> None:
 
 def surrogate_maps(rows: Sequence[Row]) -> Figure | None:
     """r_hat as a heat map beside the true l_H + r_H, for the first seed of each environment and method that learned one."""
-    rows = [row for row in _good(rows) if _navigates(row) and row.run.surrogate is not None]
+    rows = [row for row in _good(rows) if has_map(row.run) and row.run.surrogate is not None]
     if not rows:
         return None
     lam = _middle_lam(rows)

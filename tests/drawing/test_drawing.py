@@ -141,6 +141,40 @@ def test_in_a_film_who_is_done_stands_still(tmp_path):
     assert np.abs(shown[0][height:] - shown[1][height:]).max() < 10
 
 
+def test_a_ghost_is_only_of_what_is_elsewhere():
+    box, _, *rest = SHAPES
+    expected = Scene((box, Circle(1.4, 1.0, 0.5, "#123456"), *rest), SCENE.extent)
+    *shown, ghost = scenes.with_ghost(SCENE, expected).shapes
+    assert tuple(shown) == SHAPES
+    assert ghost == Circle(1.4, 1.0, 0.5, f"#123456{scenes.CLEAR}", outline="ink")
+    assert scenes.with_ghost(SCENE, SCENE) == SCENE
+    line = Polyline(((0.0, 0.0), (1.0, 1.0)), "agent")
+    drawn(scenes.with_ghost(SCENE, Scene((*SHAPES, line), SCENE.extent)))
+
+
+def test_strips_across_have_a_row_for_each_clip():
+    tall = Scene(SHAPES[1:2], (0.0, 2.0, 0.0, 2.0))
+    figure = scenes.strips_across({"one": {"a": SCENE, "b": SCENE}, "two": {"c": tall, "d": tall}}, "a note")
+    assert [axes.get_title("left") for axes in figure.axes] == ["one", "", "two", ""]
+    assert [axes.get_xlabel() for axes in figure.axes] == ["a", "b", "c", "d"]
+    figure.canvas.draw()
+    one, two = (figure.axes[place].get_window_extent().height for place in (0, 2))
+    assert two > 1.5 * one, "a row is as high as its scenes"
+
+
+def test_a_small_film_in_columns(tmp_path):
+    from PIL import Image
+
+    moving = [Scene((Circle(x, 1.0, 0.5, "agent"),), SCENE.extent) for x in (1.0, 2.0, 3.0)]
+    clips = dict.fromkeys(("one", "two", "three"), moving)
+    scenes.film(clips, tmp_path / "whole.gif", rate=4, columns=2)
+    scenes.small_film(clips, tmp_path / "small.gif", rate=4, columns=2)
+    with Image.open(tmp_path / "whole.gif") as whole, Image.open(tmp_path / "small.gif") as small:
+        assert small.n_frames == whole.n_frames == 3
+        assert whole.width == 2 * 6 * 100, "two columns of six inches"
+        assert small.height < whole.height, "without its margin"
+
+
 # --- navigation's maps ----------------------------------------------------------------------------------------------------
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 import peps_jax
-from peps_jax.execution import batches, memory, program
+from peps_jax.execution import batches, devices, memory, program
 
 EPISODES = 4
 
@@ -15,6 +15,16 @@ def test_environments_share_a_program_and_methods_do_not(tiny, monkeypatch):
     configs = [tiny.replace(env=env, method=method) for env in ("nav-d1", "nav-d3") for method in ("peps", "sac")]
     planned = batches.plan(configs, EPISODES, free=10**9)
     assert [one.runs for one in planned] == [(0, 2), (1, 3)]
+
+
+def test_arrays_without_entries_are_divided_like_all_others():
+    """What a program puts out it takes in again, as a training does with a MuJoCo model that has no activations."""
+    used = jax.devices()
+    rows = jax.device_put((jnp.zeros((2, 3)), jnp.zeros((2, 4, 0))), devices.sharding(used))
+    once = devices.over_devices(lambda rows: (rows[0] + 1, rows[1] * 2), used).lower(rows).compile()
+    twice, empty = once(once(rows))
+    assert float(twice[0, 0]) == 2
+    assert empty.shape == (2, 4, 0)
 
 
 def test_what_does_not_fit_is_split_into_batches_of_one_size(line):

@@ -1,5 +1,6 @@
 """Compiled programs are found again by another process, and only by one that would make the same."""
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import Line, LineParams
 
+import peps_envs
 from peps_jax import methods
 from peps_jax.execution import compilation_cache, program
 from peps_jax.storage import files
@@ -119,6 +121,17 @@ def test_nothing_is_kept_where_that_is_turned_off_or_impossible(tmp_path, monkey
         with pytest.raises(AssertionError):
             kept("a", refuse)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_what_no_other_process_can_tell_has_no_name(tiny):
+    """A compiled model, say: printed, it is a place in memory."""
+    task = peps_envs.make("nav-d1")
+    fields, bases = [("model", object, object())], (type(task.environment),)
+    made = dataclasses.make_dataclass("Modelled", fields, bases=bases, frozen=True)
+    made.__module__ = "peps_envs.bridges"
+    config = tiny.replace(env=task.environment, params=task.params, belief=task.params)
+    assert program.written(config) is not None
+    assert program.written(config.replace(env=made())) is None
 
 
 def test_foreign_code_has_no_name(tiny, monkeypatch):

@@ -22,6 +22,7 @@ from peps_jax.reproduce import (
     figure1,
     figure3,
     frontier,
+    physics,
     plan,
     queries,
     store,
@@ -38,6 +39,12 @@ from peps_jax.storage.tables import latex, markdown
 
 def call(arguments, tiny) -> int:
     return exit_code(lambda arguments: command.main(arguments, tiny, EPISODES), *arguments)
+
+
+@pytest.fixture(autouse=True)
+def no_physics(monkeypatch):
+    """`test_physics.py` is about it; MuJoCo takes a while to import."""
+    monkeypatch.setattr(physics, "TASKS", ())
 
 
 @pytest.fixture
@@ -286,6 +293,7 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
     monkeypatch.setattr(experiment.Part, "make", lambda part, num_episodes: made_up(1.0))
     monkeypatch.setattr(experiment, "findings", lambda parts, seen: {part.method for part in parts})
     monkeypatch.setattr(figure3.report, "write", lambda found, folder: [folder / f"figure3 of {len(found)} methods"])
+    monkeypatch.setattr(physics, "write", lambda plan, folder: [])
     fill(tmp_path, tiny, seeds=3)
     assert call(["all", "--seeds", 3, "--out", tmp_path], tiny) == 0
     written = {path.name for path in tmp_path.iterdir()} - {store.HEAD, store.KEPT}

@@ -38,6 +38,8 @@ GOAL_REWARD = 90.0
 TOP_SPEED = 2.5  # m/s, to which observed velocities are scaled
 GLIDE = 0.3  # s, for which the drawn line shows the sled's velocity
 
+MISJUDGED = ("friction of the ice", ICE, ASPHALT)  # in truth, and as people take it
+
 # MuJoCo's friction lifts what slides fast, so that it hops; a soft ground (`solimp`) and damping of z keep the sled in touch. With
 # fewer than 20 iterations of the line search the elliptic cone doesn't converge at rest.
 XML = """
@@ -138,9 +140,9 @@ def scene(compiled: mujoco.MjModel, data: mujoco.MjData) -> Scene:
         ((1.0, -1.6), (1.7, -1.2)),
     )
     shapes = (
-        area((-HALF, -HALF, HALF, HALF), "#f4f1e8"),
+        area((-HALF, -HALF, HALF, HALF), "snow"),
         area((SHORE[0], -HALF, HALF, SHORE[1]), "ice"),
-        *(Polyline(line, "#ffffff") for line in scratches),
+        *(Polyline(line, "floor") for line in scratches),
         area(GOAL, "goal"),
         Polyline((tuple(map(float, place)), tuple(map(float, ahead))), "ink"),
         Circle(float(place[0]), float(place[1]), RADIUS, "agent", outline="ink"),

@@ -37,6 +37,8 @@ SWIFT, TURNING = 5.0, 6.0  # m/s and rad/s, units in which speeds are observed
 # m, x to the right and z upwards from the shoulder
 GOAL = (UPPER + FOREARM) * np.array([math.sin(SIDE), math.cos(SIDE)])
 
+MISJUDGED = ("mass of the payload, kg", PAYLOAD, LOOKS)  # in truth, and as people take it
+
 XML = f"""
 <mujoco model="reacher">
   <option timestep="0.025" integrator="implicitfast"><flag contact="disable"/></option>
