@@ -1,6 +1,6 @@
 """What the programs of a training are made of, and what compiling them takes; writes benchmarks/results/compilation.md.
 
-    python benchmarks/compilation.py [--env nav-d1] [--methods peps sac] [--lines]
+    python benchmarks/compilation.py [--envs nav-d1 mjx-box] [--methods peps sac] [--lines]
 
 Each method in a fresh process without any cache, in CPU-seconds, compiled as `jax.jit` does. `--lines` prints, of each program, the
 lines of StableHLO by the functions that they come from: with all that a function calls, and its own.
@@ -12,6 +12,7 @@ import argparse
 import ast
 import collections
 import functools
+import itertools
 import os
 import pathlib
 import re
@@ -60,7 +61,7 @@ def measure(env: str, method: str) -> list[list[str]]:
         compiled = lowered.compile()
         end = seconds()
         lines, fusions = len(lowered.as_text().splitlines()), compiled.as_text().count(" fusion(")
-        rows.append([method, name, f"{lines:,}", f"{fusions:,}", f"{between - start:.1f}", f"{end - between:.1f}"])
+        rows.append([env, method, name, f"{lines:,}", f"{fusions:,}", f"{between - start:.1f}", f"{end - between:.1f}"])
     return rows
 
 
@@ -113,26 +114,46 @@ def print_lines(env: str, method: str) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--env", default="nav-d1")
+    parser.add_argument("--envs", nargs="+", default=["nav-d1", "mjx-box"])
     parser.add_argument("--methods", nargs="+", default=["peps", "sac"])
     parser.add_argument("--lines", action="store_true", help="print what programs are made of, and compile nothing")
     parser.add_argument("--one", help=argparse.SUPPRESS)  # this process measures one method
     given = parser.parse_args()
     if given.one:
-        print("\n".join("\t".join(row) for row in measure(given.env, given.one)))
+        print("\n".join("\t".join(row) for row in measure(*given.envs, given.one)))
         return
+    asked = list(itertools.product(given.envs, given.methods))
     if given.lines:
-        for method in given.methods:
-            print_lines(given.env, method)
+        for env, method in asked:
+            print_lines(env, method)
         return
     rows = []
-    for method in given.methods:
-        command = [sys.executable, __file__, "--env", given.env, "--one", method]
+    for env, method in asked:
+        command = [sys.executable, __file__, "--envs", env, "--one", method]
         environment = os.environ | {"PEPS_JAX_CACHE": "", "JAX_PLATFORMS": "cpu"}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, encoding="utf-8")
-        rows += [line.split("\t") for line in done.stdout.splitlines()]
-    head = ["method", "program", "lines of StableHLO", "fusions", "CPU-s to trace and lower", "CPU-s to compile"]
-    text = f"{given.env}, defaults, cold in a fresh process:\n\n{markdown(head, rows)}"
+        found = [line.split("\t") for line in done.stdout.splitlines()]
+        rows += [
+            *found,
+            [
+                env,
+                method,
+                "**all**",
+                "",
+                "",
+                *(f"**{sum(float(row[place]) for row in found):.1f}**" for place in (5, 6)),
+            ],
+        ]
+    head = [
+        "task",
+        "method",
+        "program",
+        "lines of StableHLO",
+        "fusions",
+        "CPU-s to trace and lower",
+        "CPU-s to compile",
+    ]
+    text = f"Defaults, cold in a fresh process:\n\n{markdown(head, rows)}"
     OUT.write_text(text, encoding="utf-8")
     print(text)
 
