@@ -76,11 +76,12 @@ def _highway(domain: str) -> Callable[[], Task]:
 def _physics(module: str) -> Callable[[], Task]:
     # kept, because a compiled MuJoCo model equals itself alone; imported when it is asked for, because MuJoCo takes a second
     @functools.cache
-    def make() -> Task:
+    def made(double_precision: bool) -> Task:
+        del double_precision  # which its parameters are of
         with jax.ensure_compile_time_eval():  # a task may be made while a training is traced
             return Task(*importlib.import_module(f"peps_envs.physics.{module}").domain())
 
-    return make
+    return lambda: made(jax.config.jax_enable_x64)
 
 
 for _domain in navigation.DOMAINS:

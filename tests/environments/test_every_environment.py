@@ -15,14 +15,6 @@ STEPS = 20
 NAMES = peps_envs.names()
 
 
-@pytest.fixture(autouse=True)
-def _lenient(request):
-    """MJX mixes ranks."""
-    modelled = "mjx-" in request.node.name
-    with jax.numpy_rank_promotion("allow" if modelled else "raise"):
-        yield
-
-
 @functools.cache
 def seen(name: str) -> tuple:
     """What `judged_step` returned of a few random steps, and l and r under the truth and each belief."""

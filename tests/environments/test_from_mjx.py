@@ -53,12 +53,6 @@ def draw(model, data):
     return Scene((ball,), (-1.0, 2.0, -1.0, 1.0))
 
 
-@pytest.fixture(autouse=True)
-def _lenient():
-    with jax.numpy_rank_promotion("allow"):  # MJX mixes ranks
-        yield
-
-
 @functools.cache
 def push(**changes):
     settings = dict(horizon=STEPS, scene=draw) | changes

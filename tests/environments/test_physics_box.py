@@ -14,12 +14,6 @@ from peps_envs.physics import box  # noqa: E402
 STEPS = 100
 
 
-@pytest.fixture(autouse=True)
-def _lenient():
-    with jax.numpy_rank_promotion("allow"):  # MJX mixes ranks
-        yield
-
-
 @pytest.fixture(scope="module")
 def task():
     return peps_envs.make("mjx-box")
@@ -71,8 +65,7 @@ def walks(task):
 
 @pytest.fixture(scope="module")
 def routes(task):
-    with jax.numpy_rank_promotion("allow"):
-        return tuple(walks(task))
+    return tuple(walks(task))
 
 
 def test_pushing_is_short_and_surprises_at_every_step(routes):

@@ -18,12 +18,6 @@ OVER_SNOW = ((-1.3, 1.12), (1.7, 1.12))
 LAMBDA = 2.4
 
 
-@pytest.fixture(autouse=True)
-def _lenient():
-    with jax.numpy_rank_promotion("allow"):  # MJX mixes ranks
-        yield
-
-
 def thrust(place, velocity, aim):
     """Full thrust towards `aim`, with less of it the faster the sled is."""
     ahead = aim - place

@@ -16,12 +16,6 @@ from peps_envs.physics import reacher  # noqa: E402
 NUDGE = 0.03  # of the motor's torque, with which the arm begins to fall to the left
 
 
-@pytest.fixture(autouse=True)
-def _lenient():
-    with jax.numpy_rank_promotion("allow"):  # MJX mixes ranks
-        yield
-
-
 @pytest.fixture
 def task():
     return peps_envs.make("mjx-reacher")  # kept by the registry

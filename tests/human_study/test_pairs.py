@@ -99,3 +99,15 @@ def test_the_same_seed_makes_the_same_pairs(routes):
     other = pairs.to_ask("nav-d4", 1, 60)
     assert np.array_equal(again.action, routes.action)
     assert not np.array_equal(other.action, routes.action)
+
+
+@pytest.mark.long
+def test_people_compare_physics_too():
+    task = pairs.problem("mjx-box")
+    asked = pairs.to_ask("mjx-box", 0, 3)
+    shown = pairs.pairs_of(task, asked)
+    agents = [[shape for shape in json.loads(drawing)["shapes"] if isinstance(shape, dict) and shape["colour"] == "agent"]
+              for one in shown for drawing in one.drawings]  # fmt: skip
+    assert [len(found) for found in agents] == [1] * 6
+    again = pairs.segments_of(task, shown)
+    assert jax.tree.all(jax.tree.map(np.array_equal, again, asked._replace(worth=None)))

@@ -16,7 +16,7 @@ import contextlib
 import copy
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -92,7 +92,7 @@ class FromMjx(Simulator):
         del key  # MuJoCo's steps have no chance in them
         before = self._data(inner, params)
         data, _ = jax.lax.scan(
-            lambda data, _: (mjx.step(params, data), None),
+            lambda data, _: (self._stepped(data, params), None),
             before.replace(ctrl=self._control(action)),
             None,
             self.substeps,
@@ -126,7 +126,12 @@ class FromMjx(Simulator):
 
     def _posed(self, data: mjx.Data, params: mjx.Model) -> mjx.Data:
         """With bodies, geoms and sites where `qpos` puts them; a step leaves them where they were before it."""
-        return mjx.kinematics(params, data)
+        with _any_ranks():
+            return mjx.kinematics(params, data)
+
+    def _stepped(self, data: mjx.Data, params: mjx.Model) -> mjx.Data:
+        with _any_ranks():
+            return mjx.step(params, data)
 
     def _kept(self, data: mjx.Data) -> MjxState:
         events = jnp.asarray([sign(data) for sign in self.signs], bool)
@@ -213,6 +218,11 @@ def from_mjx(
             f"{name}: observations hide {', '.join(hidden)}, on which what follows depends; let `observe` show it"
         )
     return dataclasses.replace(made, observation_size=observation.shape[0])
+
+
+def _any_ranks() -> contextlib.AbstractContextManager[Any]:
+    """MJX mixes ranks, whatever its user allows."""
+    return jax.numpy_rank_promotion("allow")
 
 
 def _perceived(inner: MjxState) -> Array:
