@@ -98,7 +98,7 @@ def collected(steps=10, num_envs=3, ends=()):
     point = Point(place, jnp.zeros((steps, num_envs), jnp.int32))
     transition = Transition(
         place, jnp.zeros_like(place), jnp.zeros((steps, num_envs)), place + 1, jnp.ones_like(place), terminated,
-        jnp.zeros((steps, num_envs)),
+        jnp.zeros((steps, num_envs)), jnp.zeros((steps, num_envs)),
     )  # fmt: skip
     return Trajectory(
         transition, over, jnp.zeros((steps, num_envs, 1), bool), jnp.zeros((steps, num_envs, 2)), point, point
