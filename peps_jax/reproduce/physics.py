@@ -55,8 +55,8 @@ ABOUT = "tasks on MuJoCo models, of which the human believes another one"
 TASKS = tuple(f"mjx-{module}" for module in registry.PHYSICS)
 METHODS = ("peps", *BASELINES, "oracle", "darc")
 SHOWN = ("sac", "peps")  # in pictures, and judged by humans of other beliefs
-# Changes of the plan's settings that a task needs, by its name, for methods that learn T_A. At the defaults' pace T_A isn't sure yet
-# how a sled moves when the policy settles, and H_T pays for staying where it isn't
+# Changes of the plan's settings that a task needs, by its name, for methods that learn T_A. At the defaults' pace T_A isn't sure
+# yet how a sled moves when the policy settles, and H_T pays for staying where it isn't
 SETTINGS: dict[str, dict[str, Any]] = {"mjx-ice": {"dynamics_learning_rate": 3e-3}}
 LEARN_DYNAMICS = ("peps", "oracle")
 

@@ -128,7 +128,13 @@ def test_random_steps_are_mjxs_bit_by_bit():
     environment = push()
     model = environment.model(compiled(5.0))
     step = jax.jit(jax.vmap(lambda state, action: environment.step(jax.random.key(0), state, action, model)))
-    theirs = jax.jit(jax.vmap(lambda data, action: mjx.step(model, data.replace(ctrl=action * jnp.array([1.0, 2.0])))))
+
+    @jax.jit
+    @jax.vmap
+    def theirs(data, action):
+        with jax.numpy_rank_promotion("allow"):  # which MJX needs
+            return mjx.step(model, data.replace(ctrl=action * jnp.array([1.0, 2.0])))
+
     states = jax.vmap(lambda key: environment.reset(key, model)[0])(jax.random.split(jax.random.key(0), 200))
     data = jax.vmap(lambda _: mjx.make_data(compiled(5.0), impl="jax"))(jnp.arange(200))
     for key in jax.random.split(jax.random.key(1), 100):
