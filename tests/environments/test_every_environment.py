@@ -9,6 +9,7 @@ import pytest
 
 import peps_envs
 from peps_envs import Discrete, Scene
+from peps_envs.environment import side_by_side
 from peps_jax.drawing.panels import ROLES
 
 STEPS = 20
@@ -20,6 +21,9 @@ def seen(name: str) -> tuple:
     """What `judged_step` returned of a few random steps, and l and r under the truth and each belief."""
     task = peps_envs.make(name)
     environment, space = task.environment, task.environment.action_space
+    whose = task.beliefs | {"truth": task.params}
+    together = side_by_side(*whose.values())
+    each = lambda of: dict(zip(whose, jax.vmap(of)(together), strict=True))  # compiled once for all of them
 
     def random_action(key):
         if isinstance(space, Discrete):
@@ -30,12 +34,11 @@ def seen(name: str) -> tuple:
         key_act, key_step = jax.random.split(key)
         action = random_action(key_act)
         after, judged = environment.judged_step(key_step, state, action, task.params, task.beliefs[task.default_belief])
+        perceived = environment.perceive(after.state)
         density = lambda params: environment.next_state_distribution(state, action, params)
-        surprises = {belief: density(params).relative_log_prob(environment.perceive(after.state))
-                     for belief, params in (task.beliefs | {"truth": task.params}).items()}  # fmt: skip
-        rewards = {belief: environment.reward(state, action, after.state, params)
-                   for belief, params in (task.beliefs | {"truth": task.params}).items()}  # fmt: skip
-        return after.state, (after, environment.perceive(after.state), surprises, rewards, judged)
+        surprises = each(lambda params: density(params).relative_log_prob(perceived))
+        rewards = each(lambda params: environment.reward(state, action, after.state, params))
+        return after.state, (after, perceived, surprises, rewards, judged)
 
     @jax.jit
     def walk(key):
