@@ -197,12 +197,22 @@ def _learned(run: FinishedRun) -> bytes:
         "agents": run.agents,
         "knowledge": run.knowledge,
         "curves": run.curves,
-        "params": problem.params,
-        "belief": problem.belief,
+        "params": _numbered(problem.params),
+        "belief": _numbered(problem.belief),
         "evaluation": run.evaluation,
         "failed": run.failed,
     }
     return flax.serialization.to_bytes(jax.tree.map(np.asarray, parts))
+
+
+def _numbered(tree: Any) -> dict[str, Any]:
+    """The leaves of a tree, whatever it is made of: parameters may be another ecosystem's, such as a MuJoCo model."""
+    return {str(place): leaf for place, leaf in enumerate(jax.tree.leaves(tree))}
+
+
+def _like(tree: Any, numbered: Mapping[str, Any]) -> Any:
+    """What `_numbered` was given, of the structure of `tree`."""
+    return jax.tree.unflatten(jax.tree.structure(tree), [numbered[str(place)] for place in range(len(numbered))])
 
 
 def read_run(folder: Path, training: str, config: Config, num_episodes: int, checksum: str) -> FinishedRun:
@@ -270,7 +280,10 @@ def load(folder: str | os.PathLike[str], row: int | str | Mapping[str, Any]) -> 
     config = _config(configuration, entry)
     problem = config.problem()
     shapes = jax.eval_shape(lambda config: init(prepare(config)), config)
-    empty = {"agents": shapes.agents, "knowledge": shapes.knowledge, "params": problem.params, "belief": problem.belief}
+    numbers = {"params": problem.params, "belief": problem.belief}
+    empty = {"agents": shapes.agents, "knowledge": shapes.knowledge} | {
+        name: _numbered(tree) for name, tree in numbers.items()
+    }
     path = folder / entry["file"]
     try:
         content = path.read_bytes()
@@ -285,7 +298,7 @@ def load(folder: str | os.PathLike[str], row: int | str | Mapping[str, Any]) -> 
     except (ValueError, KeyError) as error:
         reason = str(error).splitlines()[0]
         raise ValueError(f"file {str(path)!r} was written by a version that doesn't fit this one: {reason}") from None
-    config = config.replace(params=parts["params"], belief=parts["belief"])
+    config = config.replace(**{name: _like(tree, parts[name]) for name, tree in numbers.items()})
     answers = folder / ANSWERS / f"{path.stem}.npz"
     preferences = data.load(answers) if answers.exists() else None
     return Result(prepare(config), parts["agents"], parts["knowledge"], preferences, curves)

@@ -227,6 +227,20 @@ def test_every_method_is_swept_and_loaded(line, line_task, tmp_path):
         assert result.act(jnp.zeros(1)).shape == (1,)
 
 
+@pytest.mark.long
+def test_a_mujoco_models_numbers_are_kept_with_what_was_learned(line, tmp_path):
+    pytest.importorskip("mujoco")
+    flags = ["--env", "mjx-box", "--method", "sac", "--belief", "heavy", "--seeds", "1", *tiny_flags(line)]
+    assert call([*flags, "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "routes.png").exists()
+    result = peps_jax.load(tmp_path, 0)
+    task = peps_envs.make("mjx-box")
+    equal = lambda one, other: jax.tree.all(jax.tree.map(np.array_equal, one, other))
+    assert equal(result.training.problem.params, task.params)
+    assert equal(result.training.problem.belief, task.beliefs["heavy"])
+    assert result.act(jnp.zeros(task.environment.observation_size)).shape == (2,)
+
+
 @pytest.mark.slow
 def test_every_method_with_a_surrogate_reward_has_its_heat_map(tiny):
     rows = []
