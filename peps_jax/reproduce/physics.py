@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import peps_envs
 from peps_envs import Scene, physics, registry
+from peps_envs.environment import side_by_side
 from peps_jax.analysis import episodes
 from peps_jax.config import Config
 from peps_jax.drawing import scenes
@@ -101,7 +101,7 @@ class Watched:
         seen = episodes.episode(run, jax.random.key(0))  # all that is shown has one start
         expected = episodes.expected(run.training.problem, seen, AHEAD)
         believe = physics.misjudged(self.task).belief
-        beliefs = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(believe, quantities(self.task)))
+        beliefs = side_by_side(*map(believe, quantities(self.task)))
         judged = episodes.judged(run, beliefs, JUDGED)
         kept = {"length": seen.length, "judged": judged}
         for name, states in {"states": seen.states, "expected": expected}.items():

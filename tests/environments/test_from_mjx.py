@@ -15,6 +15,8 @@ from peps_jax import Config
 mujoco = pytest.importorskip("mujoco")
 mjx = pytest.importorskip("mujoco.mjx")
 
+from mjx_cases import in_mujoco, rolled_out  # noqa: E402
+
 from peps_envs.bridges.from_mjx import from_mjx  # noqa: E402
 
 PUSH = """
@@ -63,27 +65,6 @@ def controls(steps=STEPS):
     """Ahead, with some wobbling, so that the ball is hit more than once."""
     times = np.arange(steps)[:, None]
     return np.concatenate([np.where(times % 50 < 40, 1.0, -1.0), 0.2 * np.sin(times / 5)], 1)
-
-
-def rolled_out(environment, params, actions):
-    """Positions after each action, (steps, nq)."""
-
-    @jax.jit
-    def run(params, actions):
-        state, _ = environment.reset(jax.random.key(0), params)
-        step = lambda state, action: (environment.step(jax.random.key(0), state, action, params).state,) * 2
-        return jax.lax.scan(step, state, actions)[1].inner.qpos
-
-    return np.asarray(run(params, actions))
-
-
-def in_mujoco(model, actions):
-    data, places = mujoco.MjData(model), []
-    for action in actions:
-        data.ctrl[:] = action * model.actuator_ctrlrange[:, 1]
-        mujoco.mj_step(model, data)
-        places.append(data.qpos.copy())
-    return np.array(places)
 
 
 @pytest.mark.parametrize("mass", [5.0, 1.0])

@@ -8,6 +8,8 @@ import pytest
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.mjx")
 
+from mjx_cases import in_mujoco, rolled_out  # noqa: E402
+
 import peps_envs  # noqa: E402
 from peps_envs.physics import box  # noqa: E402
 
@@ -100,25 +102,13 @@ def test_explicability_is_a_choice(routes):
 def test_a_roll_out_is_mujocos_of_a_box_of_that_mass(task, mass):
     times = np.arange(STEPS)
     actions = np.stack([np.where(times % 30 < 22, 0.9, -0.8), 0.2 * np.sin(times / 3)], 1)
-    compiled, expected = box.model(mass), []
-    data = mujoco.MjData(compiled)
-    for action in actions:
-        data.ctrl[:] = action
-        for _ in range(box.SUBSTEPS):
-            mujoco.mj_step(compiled, data)
-        expected.append(data.qpos.copy())
-    assert np.ptp(np.array(expected)[:, 2]) > 0.1, "the box is pushed"
+    compiled = box.model(mass)
+    expected = in_mujoco(compiled, actions, box.SUBSTEPS)
+    assert np.ptp(expected[:, 2]) > 0.1, "the box is pushed"
 
     with jax.enable_x64(True):
         environment, *_ = box.domain()
-
-        @jax.jit
-        def run(params, actions):
-            state, _ = environment.reset(jax.random.key(0), params)
-            step = lambda state, action: (environment.step(jax.random.key(0), state, action, params).state,) * 2
-            return jax.lax.scan(step, state, actions)[1].inner.qpos
-
-        found = np.asarray(run(environment.model(compiled), actions))
+        found = rolled_out(environment, environment.model(compiled), actions)
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 

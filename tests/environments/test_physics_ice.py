@@ -11,6 +11,8 @@ from peps_envs.scene import Circle, Polyline, Rectangle
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.mjx")
 
+from mjx_cases import in_mujoco, rolled_out  # noqa: E402
+
 from peps_envs.physics import ice  # noqa: E402
 
 OVER_ICE = ((1.7, 1.1), (1.7, 1.1))
@@ -70,24 +72,11 @@ def test_steps_are_mujocos_with_that_friction(friction):
     times = np.arange(100)[:, None]
     actions = np.concatenate([np.sin(times / 7), 0.8 * np.cos(times / 5)], 1)
     compiled = ice.model(friction)
-    data, expected = mujoco.MjData(compiled), []
-    data.qpos[:2] = ice.START
-    for action in actions:
-        data.ctrl[:] = action
-        mujoco.mj_step(compiled, data, ice.SUBSTEPS)
-        expected.append(data.qpos.copy())
-    expected = np.array(expected)
+    expected = in_mujoco(compiled, actions, ice.SUBSTEPS, ice.START)
     assert expected[:, 0].max() > ice.SHORE[0] + 0.5
     with jax.enable_x64(True):
         environment, _, _ = ice.domain()
-
-        @jax.jit
-        def run(params, actions):
-            state, _ = environment.reset(jax.random.key(0), params)
-            step = lambda state, action: (environment.step(jax.random.key(0), state, action, params).state,) * 2
-            return jax.lax.scan(step, state, actions)[1].inner.qpos
-
-        exact = run(environment.model(compiled), actions)
+        exact = rolled_out(environment, environment.model(compiled), actions)
     np.testing.assert_allclose(exact, expected, atol=1e-6)
 
 

@@ -10,6 +10,8 @@ import pytest
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.mjx")
 
+from mjx_cases import in_mujoco, rolled_out  # noqa: E402
+
 import peps_envs  # noqa: E402
 from peps_envs.physics import reacher  # noqa: E402
 
@@ -94,22 +96,11 @@ def test_a_roll_out_is_mujocos_of_that_payload(payload):
     times = np.arange(steps)
     actions = np.stack([np.sin(times / 6), np.where(times % 20 < 10, 1.0, -1.0)], 1)
     compiled = reacher.model(payload)
-    data, expected = mujoco.MjData(compiled), []
-    for action in actions:
-        data.ctrl[:] = action * compiled.actuator_ctrlrange[:, 1]
-        mujoco.mj_step(compiled, data, nstep=reacher.SUBSTEPS)
-        expected.append(data.qpos.copy())
+    expected = in_mujoco(compiled, actions, reacher.SUBSTEPS)
     with jax.enable_x64(True):
         environment, _, _ = reacher.domain()
-
-        @jax.jit
-        def run(params, actions):
-            start, _ = environment.reset(jax.random.key(0), params)
-            step = lambda state, action: (environment.step(jax.random.key(0), state, action, params).state,) * 2
-            return jax.lax.scan(step, start, actions)[1].inner.qpos
-
-        places = run(environment.model(compiled), jnp.asarray(actions))
-    assert np.ptp(np.array(expected), axis=0).min() > 0.5, "both joints move"
+        places = rolled_out(environment, environment.model(compiled), actions)
+    assert np.ptp(expected, axis=0).min() > 0.5, "both joints move"
     np.testing.assert_allclose(places, expected, atol=1e-6)
 
 

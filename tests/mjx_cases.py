@@ -1,0 +1,28 @@
+"""Roll-outs of MuJoCo models, by the environments that are made of them and by MuJoCo itself."""
+
+import jax
+import mujoco
+import numpy as np
+
+
+def rolled_out(environment, params, actions):
+    """Positions after each action, (steps, nq)."""
+
+    @jax.jit
+    def run(params, actions):
+        state, _ = environment.reset(jax.random.key(0), params)
+        step = lambda state, action: (environment.step(jax.random.key(0), state, action, params).state,) * 2
+        return jax.lax.scan(step, state, actions)[1].inner.qpos
+
+    return np.asarray(run(params, actions))
+
+
+def in_mujoco(model, actions, substeps=1, start=()):
+    """The same of MuJoCo, whose first positions are `start`, and controls as far as they go at an action of 1."""
+    data, places = mujoco.MjData(model), []
+    data.qpos[: len(start)] = start
+    for action in actions:
+        data.ctrl[:] = action * model.actuator_ctrlrange[:, 1]
+        mujoco.mj_step(model, data, substeps)
+        places.append(data.qpos.copy())
+    return np.array(places)
