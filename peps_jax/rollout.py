@@ -112,7 +112,7 @@ def collect(
         start, first = reset(split(key_reset), params)
         restart = lambda new, old: jax.vmap(jnp.where)(over, new, old)
         moved = jax.vmap(movement, in_axes=(0, 0, None))(state, after.state, problem)
-        moved_in_mind = jax.vmap(movement_to, in_axes=(0, 0, None))(state, imagined, problem)
+        move_in_mind = jax.vmap(movement_to, in_axes=(0, 0, None))
         transition = Transition(
             observation=observation,
             action=action,
@@ -122,7 +122,7 @@ def collect(
             terminated=after.terminated,
             human_reward=score.human_return,
             log_belief=score.log_belief,
-            imagined=moved_in_mind if settings.imagines else None,
+            imagined=move_in_mind(state, imagined, problem) if settings.imagines else None,
         )
         row = Trajectory(transition, after.truncated, after.events, score.worth, state, after.state)
         return (jax.tree.map(restart, start, after.state), restart(_seen(first), seen)), (row, score)
