@@ -75,9 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "film.gif")
     given = parser.parse_args(arguments)
     made = clips(Config(env=ENV, seed=given.seed, total_steps=given.steps))
-    longest = max(map(len, made.values())) + REST
-    made = {title: [*clip, *[clip[-1]] * (longest - len(clip))] for title, clip in made.items()}
-    small_film(made, given.out, RATE, columns=len(made), width=WIDTH)
+    small_film(made, given.out, RATE, len(made), WIDTH, REST)
 
 
 if __name__ == "__main__":

@@ -105,10 +105,12 @@ def _noted(figure: Figure, note: str) -> Figure:
     return figure
 
 
-def film(clips: Mapping[str, Sequence[Scene]], path: Path, rate: float, columns: int = 1, width: float = 6.0) -> None:
+def film(
+    clips: Mapping[str, Sequence[Scene]], path: Path, rate: float, columns: int = 1, width: float = 6.0, rest: int = 0
+) -> None:
     """Writes a GIF of `rate` scenes a second: the clips by their titles, in rows of so many `columns`.
 
-    A clip is `width` inches wide. One that is over before the others stands still.
+    A clip is `width` inches wide. One that is over before the others stands still, and all do for `rest` pictures at the end.
     """
     from PIL import Image
 
@@ -118,7 +120,7 @@ def film(clips: Mapping[str, Sequence[Scene]], path: Path, rate: float, columns:
     for axes in grid.flat[len(clips) :]:
         axes.set_axis_off()
     frames = []
-    for place in range(max(map(len, clips.values()))):
+    for place in range(max(map(len, clips.values())) + rest):
         for axes, (title, clip) in zip(grid.flat, clips.items(), strict=False):
             draw(axes, clip[min(place, len(clip) - 1)])
             axes.set_title(title, color=INK, fontsize=9, loc="left")
@@ -133,12 +135,12 @@ def film(clips: Mapping[str, Sequence[Scene]], path: Path, rate: float, columns:
 
 
 def small_film(
-    clips: Mapping[str, Sequence[Scene]], path: Path, rate: float, columns: int = 1, width: float = 6.0
+    clips: Mapping[str, Sequence[Scene]], path: Path, rate: float, columns: int = 1, width: float = 6.0, rest: int = 0
 ) -> None:
     """As `film`, without its white margin, and with one palette of `COLOURS` for all its pictures."""
     from PIL import Image, ImageChops, ImageSequence
 
-    film(clips, path, rate, columns, width)
+    film(clips, path, rate, columns, width, rest)
     with Image.open(path) as whole:
         frames = [frame.convert("RGB") for frame in ImageSequence.Iterator(whole)]
         times = [frame.info.get("duration", whole.info["duration"]) for frame in ImageSequence.Iterator(whole)]

@@ -280,9 +280,7 @@ def _pictures(plan: Plan, folder: Path) -> list[Path]:
         caption.replace(": ", "\n"): _film(training.view, plan.record(training))
         for caption, training in typical.items()
     }
-    longest = max(map(len, moving.values())) + REST
-    moving = {caption: [*clip, *[clip[-1]] * (longest - len(clip))] for caption, clip in moving.items()}
-    files.write_with(film, lambda path: scenes.small_film(moving, path, RATE, columns=len(SHOWN), width=CLIP))
+    files.write_with(film, lambda path: scenes.small_film(moving, path, RATE, len(SHOWN), CLIP, REST))
     return [strips, film]
 
 
