@@ -40,9 +40,14 @@ half of its own rate at most.
 """
 
 
-def training(env: str, method: str) -> tuple[float, float]:
-    """Steps a second of a training after its random start, one on each device, and seconds of compilation."""
-    configs = [shared(Config(env=env, method=method, seed=seed)) for seed in range(jax.device_count())]
+def alone(env: str, num_envs: int) -> float:
+    """Steps a second of the physics and nothing else."""
+    return environments.ours((env,), num_envs, STEPS)[env]["rate"]
+
+
+def training(config: Config) -> tuple[float, float]:
+    """Steps a second of `config`'s training after its random start, one on each device, and seconds of compilation."""
+    configs = [shared(config.replace(seed=seed)) for seed in range(jax.device_count())]
     warm = configs[0].warmup_rounds
     batch = timing.spread(stack(configs))
     states, _ = timing.compiled(begin, batch)
@@ -55,10 +60,9 @@ def training(env: str, method: str) -> tuple[float, float]:
 
 def row(env: str) -> list[str]:
     """A task's line of the table."""
-    alone = lambda: environments.ours((env,), Config().num_envs, STEPS)[env]["rate"]
-    before = alone()
-    (sac, sac_compiles), (peps, peps_compiles) = training(env, "sac"), training(env, "peps")
-    physics = (before + alone()) / 2
+    before = alone(env, Config().num_envs)
+    (sac, sac_compiles), (peps, peps_compiles) = (training(Config(env=env, method=name)) for name in ("sac", "peps"))
+    physics = (before + alone(env, Config().num_envs)) / 2
     return [env, f"{physics:,.0f}", f"{sac:,.0f}", f"{peps:,.0f}", f"{peps / physics:.0%}", f"{peps / sac:.0%}",
             f"{sac_compiles:.0f}", f"{peps_compiles:.0f}", f"{peps_compiles / sac_compiles:.1f}"]  # fmt: skip
 

@@ -1,0 +1,91 @@
+"""What PEPS gains by learning less for every step of the physics, and what it then learns; writes results/physics_pace.md.
+
+    python benchmarks/physics_pace.py [--seeds 10]
+
+The same simulator is stepped in every way of `WAYS`; what changes is how many steps share a gradient step. All ways are measured
+on the box, and on the other tasks those of `EVERYWHERE`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import pathlib
+
+if __name__ == "__main__":  # a device for every core, as a sweep has them
+    os.environ["XLA_FLAGS"] = (
+        os.environ.get("XLA_FLAGS", "") + f" --xla_force_host_platform_device_count={os.cpu_count()}"
+    )
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax
+import numpy as np
+import physics
+
+from peps_jax import Config
+from peps_jax.analysis.intervals import interquartile_mean
+from peps_jax.execution.program import program
+from peps_jax.reproduce.physics import SETTINGS
+from peps_jax.storage.tables import markdown
+
+OUT = pathlib.Path(__file__).parent / "results" / "physics_pace.md"
+EPISODES = 20
+# 64 environments in place of 16: a round has four times the steps, and as many gradient steps on every network as before
+_QUARTER = {"num_envs": 64, "updates_per_step": 0.125}
+_TWICE = _QUARTER | {"total_steps": 40_000}
+# of half as many rounds: T_A learns at the policy's rate, or H_T pays for what it doesn't know yet
+_QUICK = _TWICE | {"dynamics_learning_rate": 3e-3}
+_NONE = {"updates_per_step": 0.0025, "dynamics_updates": 1, "surrogate_updates": 1}
+WAYS = {
+    "as in the table": {},
+    "half of all updates": {"updates_per_step": 0.25, "dynamics_updates": 10, "surrogate_updates": 20},
+    "64 environments, a quarter of all updates": _QUARTER,
+    "the same, twice the steps": _TWICE,
+    "the same, T_A's rate 3e-3": _QUICK,
+    "next to no updates": _NONE,
+    "64 environments, next to no updates": _NONE | {"num_envs": 64},
+}
+EVERYWHERE = {
+    "as in the table": {},
+    "64 environments, a quarter of all updates, twice the steps, T_A's rate 3e-3": _QUICK,
+}
+_NOTE = """\
+Rates are environment steps a second of whole trainings on {devices} devices, compilation apart; "of the physics" compares with
+what the physics alone makes with as many environments, before and after. "Seconds" are those of one training on one core. Scores
+are interquartile means over {seeds} seeds, {episodes} episodes each.
+"""
+
+
+def row(env: str, way: str, changes: dict[str, float], seeds: int) -> list[str]:
+    """A way's line of the table."""
+    config = Config(env=env, **(SETTINGS.get(env, {}) | changes))
+    configs = [config.replace(seed=seed) for seed in range(seeds)]
+    before = physics.alone(env, config.num_envs)
+    compiled, _ = program(config, seeds, EPISODES, tuple(jax.devices()))
+    runs, times = compiled.run(configs)
+    rate = seeds * config.num_rounds * config.steps_per_round / times.run
+    share = 2 * rate / (before + physics.alone(env, config.num_envs))
+    over_seeds = lambda name: np.array([np.mean(getattr(run.evaluation, name)) for run in runs])
+    iqm = lambda name: f"{float(interquartile_mean(over_seeds(name)[:, None])):.1f}"
+    arrive = f"{np.sum(over_seeds('goal_reached') == 1)} of {seeds}"
+    seconds = times.run * jax.device_count() / seeds
+    made = [env, way, f"{rate:,.0f}", f"{share:.0%}", f"{seconds:.1f}", arrive, iqm("return_"), iqm("explicability")]
+    print(*made, sep=" | ", flush=True)
+    return made
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--seeds", type=int, default=10)
+    seeds = parser.parse_args().seeds
+    first, *others = physics.TASKS
+    ways = [(first, WAYS), *((env, EVERYWHERE) for env in others)]
+    rows = [row(env, way, changes, seeds) for env, named in ways for way, changes in named.items()]
+    head = ["task", "PEPS", "steps a second", "of the physics", "seconds", "arrive", "return", "explicability"]
+    text = f"{markdown(head, rows)}\n{_NOTE.format(devices=jax.device_count(), seeds=seeds, episodes=EPISODES)}"
+    OUT.write_text(text, encoding="utf-8")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
