@@ -17,7 +17,7 @@ from flax import struct
 from jax import Array
 
 from peps_jax.learning import replay
-from peps_jax.learning.networks import MLP, apply_ensemble, feature_size, features_of, init_ensemble
+from peps_jax.learning.networks import MLP, apply_ensemble, feature_size, features_of, fit_ensemble, init_ensemble
 from peps_jax.settings import DynamicsSettings
 from peps_jax.trajectory import Transition
 
@@ -63,18 +63,14 @@ def fit(
 ) -> tuple[ClassifierState, dict[str, Array]]:
     """`settings.updates` steps of Adam; each member draws minibatches of its own from the `filled` rows of replay."""
     key_batch, key_noise = jax.random.split(key)
-    optimizer = optax.adam(settings.learning_rate)
     shape = (settings.updates, settings.ensemble_size, settings.batch_size)
     batches = replay.sample(buffer, key_batch, shape, filled)
     noises = jax.random.normal(key_noise, batches.movement.shape, jnp.float32)
-
-    def update(state: ClassifierState, now: tuple[Transition, Array]) -> tuple[ClassifierState, Array]:
-        losses, grads = jax.vmap(jax.value_and_grad(loss), in_axes=(0, 0, 0, None))(state.params, *now, settings)
-        updates, optimizer_state = optimizer.update(grads, state.optimizer)
-        return ClassifierState(optax.apply_updates(state.params, updates), optimizer_state), jnp.mean(losses)
-
-    state, losses = jax.lax.scan(update, state, (batches, noises))
-    return state, {"classifier_loss": jnp.mean(losses)}
+    of_one = lambda params, batch, noise: loss(params, batch, noise, settings)
+    *fitted, losses = fit_ensemble(
+        of_one, optax.adam(settings.learning_rate), state.params, state.optimizer, batches, noises
+    )
+    return ClassifierState(*fitted), {"classifier_loss": jnp.mean(losses)}
 
 
 def log_ratio(state: ClassifierState, transitions: Transition, settings: DynamicsSettings) -> Array:

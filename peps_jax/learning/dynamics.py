@@ -21,7 +21,7 @@ from flax import struct
 from jax import Array
 
 from peps_jax.learning import replay
-from peps_jax.learning.networks import MLP, apply_ensemble, feature_size, features_of, init_ensemble
+from peps_jax.learning.networks import MLP, apply_ensemble, feature_size, features_of, fit_ensemble, init_ensemble
 from peps_jax.settings import DynamicsSettings
 from peps_jax.trajectory import Transition
 
@@ -79,17 +79,11 @@ def fit(
     state: DynamicsState, buffer: Transition, filled: Array, key: Array, settings: DynamicsSettings
 ) -> tuple[DynamicsState, dict[str, Array]]:
     """`settings.updates` steps of Adam; each member draws minibatches of its own from the `filled` rows of replay."""
-    optimizer = optax.adam(settings.learning_rate)
     shape = (settings.updates, settings.ensemble_size, settings.batch_size)
     batches = replay.sample(buffer, key, shape, filled)
-
-    def update(state: DynamicsState, batch: Transition) -> tuple[DynamicsState, Array]:
-        losses, grads = jax.vmap(jax.value_and_grad(loss), in_axes=(0, 0, None))(state.params, batch, settings)
-        updates, optimizer_state = optimizer.update(grads, state.optimizer)
-        return DynamicsState(optax.apply_updates(state.params, updates), optimizer_state), jnp.mean(losses)
-
-    state, losses = jax.lax.scan(update, state, batches)
-    return state, {"dynamics_loss": jnp.mean(losses)}
+    of_one = lambda params, batch: loss(params, batch, settings)
+    *fitted, losses = fit_ensemble(of_one, optax.adam(settings.learning_rate), state.params, state.optimizer, batches)
+    return DynamicsState(*fitted), {"dynamics_loss": jnp.mean(losses)}
 
 
 def environment_entropy(state: DynamicsState, observation: Array, action: Array, settings: DynamicsSettings) -> Array:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 from flax import linen as nn
 from jax import Array
 
@@ -178,6 +179,33 @@ def init_ensemble(network: nn.Module, key: Array, members: int, input_size: int)
 def apply_ensemble(network: nn.Module) -> Callable[[Any, Array], Array]:
     """(stacked parameters, features (..., n)) -> outputs (members, ..., output_size)."""
     return jax.vmap(network.apply, in_axes=(0, None))
+
+
+def fit_ensemble(
+    loss: Callable[..., Array],
+    optimizer: optax.GradientTransformation,
+    params: Any,
+    optimizer_state: Any,
+    *minibatches: Any,
+) -> tuple[Any, Any, Array]:
+    """A gradient step of every member on each of its own minibatches.
+
+    Args:
+      loss: (one member's parameters, *a minibatch) -> ().
+      minibatches: pytrees with leading axes (updates, members).
+
+    Returns:
+      parameters, the optimizer's state, and the members' mean loss at each update, (updates,).
+    """
+
+    def update(state: tuple[Any, Any], minibatch: tuple[Any, ...]) -> tuple[tuple[Any, Any], Array]:
+        params, optimizer_state = state
+        losses, grads = jax.vmap(jax.value_and_grad(loss))(params, *minibatch)
+        updates, optimizer_state = optimizer.update(grads, optimizer_state)
+        return (optax.apply_updates(params, updates), optimizer_state), jnp.mean(losses)
+
+    (params, optimizer_state), losses = jax.lax.scan(update, (params, optimizer_state), minibatches)
+    return params, optimizer_state, losses
 
 
 def features_of(action_space: peps_envs.ActionSpace) -> Callable[[Array, Array], Array]:
