@@ -39,9 +39,12 @@ def scenes():
     return {name: follow(jnp.array(plan), jax.random.key(0)) for name, plan in PLANS.items()}
 
 
+compare = jax.jit(comparisons.compare)
+
+
 @pytest.fixture(scope="module")
 def given():
-    return jax.jit(comparisons.compare)(jax.random.key(3))
+    return compare(jax.random.key(3), comparisons.ANSWERS)
 
 
 def test_participants_scatter_around_the_papers_means():
@@ -212,17 +215,31 @@ def test_conduct_counts_seeds_and_leaves_out_who_failed():
     assert found.return_ == [6, 7]
 
 
-def test_its_own_lambda_has_all_seeds_and_others_few(monkeypatch):
-    own, seeds = experiment.SETTINGS["lam"], range(3, 13)
+def test_the_studys_own_way_has_all_seeds_and_variants_few(monkeypatch):
+    own, seeds = experiment.OWN, range(3, 13)
     monkeypatch.setattr(experiment, "METHODS", ("peps", "sac"))
-    monkeypatch.setattr(experiment, "LAMS", (0.0, own, 8.0))
-    peps, sac, sweep = experiment.parts(seeds, 80)
-    assert (peps.lams, sac.lams, sweep.lams) == ((own,), (own,), (0.0, 8.0))
-    assert (peps.seeds, sweep.seeds) == (tuple(seeds), tuple(seeds[: experiment.FEW_SEEDS]))
-    asked = [(float(config.lam), config.seed) for config in sweep.configs]
-    assert asked == [(lam, seed) for lam in (0.0, 8.0) for seed in sweep.seeds]
-    monkeypatch.setattr(experiment, "LAMS", (own,))
+    monkeypatch.setattr(experiment, "LAMS", (0.0, own.lam, 8.0))
+    monkeypatch.setattr(experiment, "EACH", (2, own.each))
+    peps, sac, over_lambda, over_answers = experiment.parts(seeds, 80)
+    assert peps.variants == sac.variants == (own,)
+    assert [variant.lam for variant in over_lambda.variants] == [0.0, 8.0]
+    assert [variant.each for variant in over_answers.variants] == [2]
+    assert (peps.seeds, over_lambda.seeds) == (tuple(seeds), tuple(seeds[: experiment.FEW_SEEDS]))
+    asked = [(float(config.lam), config.seed, each) for config, each in over_lambda.agents]
+    assert asked == [(lam, seed, own.each) for lam in (0.0, 8.0) for seed in over_lambda.seeds]
+    assert len({part.name for part in (peps, sac, over_lambda, over_answers)}) == 4
+    monkeypatch.setattr(experiment, "LAMS", (own.lam,))
+    monkeypatch.setattr(experiment, "EACH", (own.each,))
     assert len(experiment.parts(seeds, 80)) == 2
+
+
+def test_fewer_answers_are_the_first_of_everybody(given):
+    (pairs, all_given), (same, few) = given, compare(jax.random.key(3), 3)
+    place = np.arange(len(all_given.weight)) % comparisons.ANSWERS
+    np.testing.assert_array_equal(few.weight, np.where(place < 3, all_given.weight, 0))
+    assert 0 < np.sum(few.weight > 0) <= 3 * comparisons.TRAINERS
+    np.testing.assert_array_equal(few.preferred[few.weight > 0], all_given.preferred[few.weight > 0])
+    np.testing.assert_array_equal(pairs.mask, same.mask)
 
 
 @pytest.mark.slow
@@ -233,6 +250,7 @@ def test_a_small_study_from_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(experiment, "EPISODES", 8)
     monkeypatch.setattr(experiment, "METHODS", ("peps", "sac"))
     monkeypatch.setattr(experiment, "LAMS", ())
+    monkeypatch.setattr(experiment, "EACH", (1, experiment.OWN.each))
     monkeypatch.setattr(experiment, "findings", functools.partial(experiment.findings, number=3))
     arguments = ["figure3", "--seeds", "2", "--steps", "80", "--out", str(tmp_path)]
     assert command.main(arguments) == 0
@@ -240,7 +258,8 @@ def test_a_small_study_from_end_to_end(tmp_path, monkeypatch, capsys):
     assert {path.name for path in tmp_path.iterdir()} == files | {store.HEAD, store.KEPT}
     numbers = json.loads((tmp_path / report.NUMBERS).read_text(encoding="utf-8"))
     assert set(numbers["ratings"]["mean"]) == {"peps", "sac"}
-    assert [line["lam"] for line in numbers["over_lam"]] == [experiment.SETTINGS["lam"]]
+    assert [line["lam"] for line in numbers["over_lam"]] == [experiment.OWN.lam]
+    assert [line["each"] for line in numbers["over_each"]] == [1, experiment.OWN.each]
     assert (tmp_path / report.TABLE).read_text(encoding="utf-8") in capsys.readouterr().out
 
 

@@ -179,14 +179,14 @@ def test_the_typical_training_is_the_median_one(tiny, monkeypatch):
 def test_what_the_driving_study_trained_is_kept(tmp_path, tiny, capsys, monkeypatch):
     monkeypatch.setattr(experiment, "METHODS", ("sac",))
     made, asked = Plan(tiny, 2, EPISODES), []
-    part, over_lam = figure3.needs(made)
-    assert part.name != over_lam.name
+    part, over_lam, over_answers = figure3.needs(made)
+    assert len({part.name, over_lam.name, over_answers.name}) == 3
     assert part.steps == tiny.total_steps, "the length that was asked for"
     assert figure3.needs(Plan(Config(), 2, EPISODES))[0].steps == experiment.STEPS
 
     def pretend(part, num_episodes):
         asked.append(part)
-        like = jax.eval_shape(lambda config: experiment.learn(config, part.episodes), part.configs[0])
+        like = jax.eval_shape(lambda config, each: experiment.learn(config, each, part.episodes), *part.agents[0])
         return jax.tree.map(lambda leaf: np.full((1, 2, *leaf.shape), 3, leaf.dtype), like)
 
     monkeypatch.setattr(experiment.Part, "make", pretend)

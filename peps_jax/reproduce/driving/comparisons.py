@@ -85,8 +85,12 @@ def pairs_shown(key_drive: Array, key_cut: Array) -> Segments:
     return jax.tree.map(lambda rows: rows[safe], pairs)
 
 
-def compare(key: Array) -> tuple[Segments, Answers]:
-    """The pairs that the training group is shown, and what it says of them. Who fails the sanity check doesn't count."""
+def compare(key: Array, each: Array | int = ANSWERS) -> tuple[Segments, Answers]:
+    """The pairs that the training group is shown, and what it says of them. Who fails the sanity check doesn't count.
+
+    Args:
+      each: how many of its pairs each participant answers, at most `ANSWERS`; the others weigh nothing.
+    """
     key_group, key_drive, key_cut, key_answer, key_check, _ = jax.random.split(key, 6)
     pairs = pairs_shown(key_drive, key_cut)
     shown = jax.tree.map(lambda rows: rows.reshape(TRAINERS, ANSWERS, *rows.shape[1:]), pairs)
@@ -94,6 +98,7 @@ def compare(key: Array) -> tuple[Segments, Answers]:
     given = answers(key_answer, participants, shown, road(DRY).problem())
     passed = attentive(key_check, participants)
     flat = lambda rows: rows.reshape(-1)
-    weight = jnp.where(passed[:, None], given.weight, 0.0)
+    counts = passed[:, None] & (jnp.arange(ANSWERS) < each)[None]
+    weight = jnp.where(counts, given.weight, 0.0)
     number = jnp.arange(TRAINERS * ANSWERS, dtype=jnp.int32)
     return pairs, Answers(number, flat(given.preferred), flat(weight))

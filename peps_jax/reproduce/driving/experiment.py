@@ -16,7 +16,7 @@ from peps_jax.execution.devices import compile_over_devices
 from peps_jax.execution.program import shared
 from peps_jax.preferences import data, teachers
 from peps_jax.preferences.data import Segments
-from peps_jax.reproduce.driving.comparisons import compare
+from peps_jax.reproduce.driving.comparisons import ANSWERS, compare
 from peps_jax.reproduce.driving.ratings import GROUPS, Group, groups
 from peps_jax.reproduce.driving.scenes import BEHAVIOURS, HORIZON, RAIN, behaviour, crashed, road, watch_agent
 from peps_jax.reproduce.store import settings_of
@@ -26,7 +26,7 @@ from peps_jax.train import train
 METHODS = ("peps", "sac", "drlhp", "policy_shaping")
 RATED = METHODS[:3]  # by the paper's participants. A rating says how a scene compares with the others that a rater saw
 STEPS, EPISODES = 30_000, 100  # environment steps of a training, and scenes in which it is seen
-FEW_SEEDS = 3  # at each lambda beside the study's own
+FEW_SEEDS = 3  # at each lambda and number of answers beside the study's own
 
 # A scene pays about 7, where a way through navigation's maze pays about 100: entropies weigh less, rewards needn't be scaled.
 SETTINGS = dict(
@@ -38,6 +38,7 @@ SETTINGS = dict(
     product="gaussians",  # of discrete actions
 )  # fmt: skip
 LAMS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)  # over which PEPS is shown
+EACH = (20, 50, 100, ANSWERS)  # answers of each participant, over which PEPS is shown
 
 
 def settings(method: str, seed: int, steps: int = STEPS, **changes: Any) -> Config:
@@ -59,10 +60,10 @@ class Seen(NamedTuple):
         return {str(place): np.asarray(leaf) for place, leaf in enumerate(jax.tree.leaves(self))}
 
 
-def learn(config: Config, episodes: int) -> Seen:
-    """One agent, taught by a group of its own, in the rain."""
+def learn(config: Config, each: Array | int, episodes: int) -> Seen:
+    """One agent, taught by a group of its own with `each` answers of everybody, in the rain."""
     key_group, key_watch = jax.random.split(jax.random.fold_in(generator.key(config.seed), 1))
-    result = train(config, teachers.recorded(data.recording(*compare(key_group))))
+    result = train(config, teachers.recorded(data.recording(*compare(key_group, each))))
     scenes = watch_agent(result, key_watch, episodes)
     problem = result.training.problem
     reward = jax.vmap(jax.vmap(problem.environment.reward, (0, 0, 0, None)), (0, 0, 0, None))
@@ -78,47 +79,62 @@ def learn(config: Config, episodes: int) -> Seen:
     )
 
 
+class Variant(NamedTuple):
+    """What the study is tried with."""
+
+    lam: float = SETTINGS["lam"]
+    each: int = ANSWERS  # answers of every participant
+
+
+OWN = Variant()
+
+
 class Part(NamedTuple):
-    """Agents that are trained by one program: one method's, for every lambda and seed."""
+    """Agents that are trained by one program: one method's, in every variant and with every seed."""
 
     method: str
-    lams: tuple[float, ...]
+    variants: tuple[Variant, ...]
     seeds: tuple[int, ...]
     steps: int
     episodes: int
+    over: str = ""  # what the variants differ in; nothing of the study's own
 
     @property
     def name(self) -> str:
-        lams = "" if self.lams == (SETTINGS["lam"],) else "-over-lambda"
-        return f"driving-{self.method}{lams}-{len(self.seeds)}-seeds"
+        return f"driving-{self.method}{self.over and f'-over-{self.over}'}-{len(self.seeds)}-seeds"
 
     @property
     def doing(self) -> str:
-        return f"training {len(self.configs)} agents, {self.name}"
+        return f"training {len(self.agents)} agents, {self.name}"
 
     @property
-    def configs(self) -> list[Config]:
-        return [settings(self.method, seed, self.steps, lam=lam) for lam in self.lams for seed in self.seeds]
+    def agents(self) -> list[tuple[Config, int]]:
+        """Their settings, and how many answers each of their teachers gives."""
+        return [
+            (settings(self.method, seed, self.steps, lam=variant.lam), variant.each)
+            for variant in self.variants
+            for seed in self.seeds
+        ]
 
     @property
     def recipe(self) -> dict[str, Any]:
         """What decides its numbers: every setting, road and belief by their numbers, and the code."""
-        return {"agents": list(map(_recipe, self.configs)), "scenes": self.episodes, "code": code.digest(__name__)}
+        agents = [_recipe(config) | {"each": each} for config, each in self.agents]
+        return {"agents": agents, "scenes": self.episodes, "code": code.digest(__name__)}
 
     def of(self, arrays: Mapping[str, np.ndarray]) -> Seen:
         """What a file's arrays were made of."""
-        like = jax.eval_shape(lambda config: learn(config, self.episodes), self.configs[0])
+        like = jax.eval_shape(lambda config, each: learn(config, each, self.episodes), *self.agents[0])
         return jax.tree.unflatten(jax.tree.structure(like), [arrays[str(place)] for place in range(len(arrays))])
 
     def make(self, num_episodes: int = 0) -> Seen:
-        """Trains and watches its agents over all devices: numpy arrays, (lams, seeds, ...)."""
+        """Trains and watches its agents over all devices: numpy arrays, (variants, seeds, ...)."""
         del num_episodes  # the driving study has its own
-        program, configs = compile_over_devices(
-            lambda config: learn(config, self.episodes), list(map(shared, self.configs))
-        )
-        number, shape = len(self.configs), (len(self.lams), len(self.seeds))
+        agents = [(shared(config), each) for config, each in self.agents]
+        program, leaves = compile_over_devices(lambda agent: learn(*agent, self.episodes), agents)
+        number, shape = len(agents), (len(self.variants), len(self.seeds))
         shaped = lambda rows: np.asarray(rows)[:number].reshape(*shape, *rows.shape[1:])
-        return jax.tree.map(shaped, program(configs))
+        return jax.tree.map(shaped, program(leaves))
 
 
 def _recipe(config: Config) -> dict[str, Any]:
@@ -127,11 +143,13 @@ def _recipe(config: Config) -> dict[str, Any]:
 
 
 def parts(seeds: Sequence[int], steps: int = STEPS) -> list[Part]:
-    """What is trained: each of `METHODS` with all seeds, and PEPS at the `LAMS` beside its own with fewer."""
-    own = SETTINGS["lam"]
-    made = [Part(method, (own,), tuple(seeds), steps, EPISODES) for method in METHODS]
-    others = tuple(lam for lam in LAMS if lam != own)
-    return made + [Part("peps", others, tuple(seeds[:FEW_SEEDS]), steps, EPISODES)] * bool(others)
+    """What is trained: each of `METHODS` with all seeds, and PEPS in variants beside the study's own with fewer."""
+    made = [Part(method, (OWN,), tuple(seeds), steps, EPISODES) for method in METHODS]
+    variants = {"lambda": [Variant(lam=lam) for lam in LAMS], "answers": [Variant(each=each) for each in EACH]}
+    for over, tried in variants.items():
+        others = tuple(variant for variant in tried if variant != OWN)
+        made += [Part("peps", others, tuple(seeds[:FEW_SEEDS]), steps, EPISODES, over)] * bool(others)
+    return made
 
 
 class Conduct(NamedTuple):
@@ -160,20 +178,30 @@ class Findings(NamedTuple):
 
     scenes: dict[str, Segments]  # by method, at the study's own lambda: (seeds * episodes, HORIZON, ...)
     conduct: dict[str, Conduct]  # by method
-    over_lam: dict[float, Conduct]  # of PEPS
+    variants: dict[Variant, Conduct]  # of PEPS
     groups: list[Group]  # of raters, who see what the paper's saw; the first is the study's own
     wider: list[Group]  # the same raters after they have seen every method; none if that is no more
+
+    def over(self, name: str) -> dict[float, Conduct]:
+        """How PEPS behaves over a field of `Variant`, everything else being the study's own."""
+        own = {name: getattr(OWN, name)}
+        found = {
+            getattr(variant, name): conduct
+            for variant, conduct in self.variants.items()
+            if variant._replace(**own) == OWN
+        }
+        return dict(sorted(found.items()))
 
 
 def findings(parts: Sequence[Part], seen: Sequence[Seen], number: int = GROUPS) -> Findings:
     """How the agents of `parts` behave, and how `number` groups of raters rate them."""
-    scenes, conducts, over_lam = {}, {}, {}
+    scenes, conducts, variants = {}, {}, {}
     for part, shown in zip(parts, seen, strict=True):
-        for place, lam in enumerate(part.lams):
+        for place, variant in enumerate(part.variants):
             found = conduct(jax.tree.map(lambda rows: rows[place], shown))  # noqa: B023, used at once
             if part.method == "peps":
-                over_lam[lam] = found
-            if lam == SETTINGS["lam"]:
+                variants[variant] = found
+            if variant == OWN:
                 conducts[part.method] = found
                 good = np.flatnonzero(shown.finite[place])
                 pool = lambda rows: rows[place, good].reshape(-1, *rows.shape[3:])  # noqa: B023
@@ -182,4 +210,4 @@ def findings(parts: Sequence[Part], seen: Sequence[Seen], number: int = GROUPS) 
     papers = {method: shown for method, shown in scenes.items() if method in RATED}
     wider = groups(key, scenes, road(RAIN).problem(), number) if len(scenes) > len(papers) else []
     rated = groups(key, papers, road(RAIN).problem(), number)
-    return Findings(scenes, conducts, dict(sorted(over_lam.items())), rated, wider)
+    return Findings(scenes, conducts, variants, rated, wider)

@@ -12,7 +12,7 @@ import numpy as np
 import peps_envs
 from peps_jax.drawing import scenes as pictures
 from peps_jax.preferences.data import Segments
-from peps_jax.reproduce.driving.experiment import SETTINGS, Conduct, Findings
+from peps_jax.reproduce.driving.experiment import OWN, Conduct, Findings
 from peps_jax.reproduce.driving.ratings import RATERS, Group
 from peps_jax.reproduce.driving.scenes import BEHAVIOURS, HORIZON, RAIN, typical
 from peps_jax.reproduce.summary import TITLES
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 MOMENTS = (1.0, 3.0, 5.0)  # s after the start, of the paper's Figure 3
 RATE = 6  # pictures of the film for a second of the scene
+OVER = {"lam": "λ", "each": "answers of each participant"}  # fields of a variant that have tables
 PICTURE, FILM, NUMBERS, TABLE = "figure3.png", "figure3.gif", "figure3.json", "figure3.md"
 # Gong and Zhang 2021, Figure 3: mean and standard deviation of 15 ratings; p = 0.037
 PAPER = {"peps": (7.6, 2.4), "sac": (5.0, 2.3), "drlhp": (5.9, 2.2)}
@@ -56,8 +57,11 @@ def summary(findings: Findings) -> dict[str, Any]:
     return {
         "behaviours": BEHAVIOURS,
         "conduct": {method: found._asdict() for method, found in findings.conduct.items()},
-        "over_lam": [{"lam": lam} | found._asdict() for lam, found in findings.over_lam.items()],
-        "lam": SETTINGS["lam"],
+        **{
+            f"over_{name}": [{name: value} | found._asdict() for value, found in findings.over(name).items()]
+            for name in OVER
+        },
+        **OWN._asdict(),
         **_rated(findings.groups),
         "wider": _rated(findings.wider) if findings.wider else None,
     }
@@ -89,9 +93,12 @@ def text(findings: Findings) -> str:
     ]
     if findings.wider:
         parts.append(f"With all shown, {_said(findings.wider)}\n")
-    if len(findings.over_lam) > 1:
-        rows = [[f"{lam:g}", *_behaves(found)] for lam, found in findings.over_lam.items()]
-        parts += [f"PEPS over λ, of which the study's is {SETTINGS['lam']:g}:\n", markdown(["λ", *heads], rows)]
+    for name, title in OVER.items():
+        found = findings.over(name)
+        if len(found) > 1:
+            rows = [[f"{value:g}", *_behaves(conduct)] for value, conduct in found.items()]
+            own = getattr(OWN, name)
+            parts += [f"PEPS over {title}, of which the study's is {own:g}:\n", markdown([title, *heads], rows)]
     return "\n".join(parts)
 
 
