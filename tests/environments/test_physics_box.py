@@ -107,8 +107,7 @@ def test_a_roll_out_is_mujocos_of_a_box_of_that_mass(task, mass):
     assert np.ptp(expected[:, 2]) > 0.1, "the box is pushed"
 
     with jax.enable_x64(True):
-        environment, *_ = box.domain()
-        found = rolled_out(environment, environment.model(compiled), actions)
+        found = rolled_out(task.environment, task.environment.model(compiled), actions)
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 

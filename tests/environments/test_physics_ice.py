@@ -75,7 +75,7 @@ def test_steps_are_mujocos_with_that_friction(friction):
     expected = in_mujoco(compiled, actions, ice.SUBSTEPS, ice.START)
     assert expected[:, 0].max() > ice.SHORE[0] + 0.5
     with jax.enable_x64(True):
-        environment, _, _ = ice.domain()
+        environment = peps_envs.make("mjx-ice").environment
         exact = rolled_out(environment, environment.model(compiled), actions)
     np.testing.assert_allclose(exact, expected, atol=1e-6)
 

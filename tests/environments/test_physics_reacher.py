@@ -91,15 +91,14 @@ def test_who_knows_the_mass_is_never_surprised():
 
 
 @pytest.mark.parametrize("payload", [reacher.PAYLOAD, reacher.LOOKS, 24.0])
-def test_a_roll_out_is_mujocos_of_that_payload(payload):
+def test_a_roll_out_is_mujocos_of_that_payload(task, payload):
     steps = 100
     times = np.arange(steps)
     actions = np.stack([np.sin(times / 6), np.where(times % 20 < 10, 1.0, -1.0)], 1)
     compiled = reacher.model(payload)
     expected = in_mujoco(compiled, actions, reacher.SUBSTEPS)
     with jax.enable_x64(True):
-        environment, _, _ = reacher.domain()
-        places = rolled_out(environment, environment.model(compiled), actions)
+        places = rolled_out(task.environment, task.environment.model(compiled), actions)
     assert np.ptp(expected, axis=0).min() > 0.5, "both joints move"
     np.testing.assert_allclose(places, expected, atol=1e-6)
 
