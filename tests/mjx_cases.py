@@ -7,6 +7,18 @@ import mujoco
 import numpy as np
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def begun(environment, params, key=None):
+    """The state and the observation in which an episode begins."""
+    return environment.reset(jax.random.key(0) if key is None else key, params)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def stepped(environment, state, action, params):
+    """One step."""
+    return environment.step(jax.random.key(0), state, action, params)
+
+
 def rolled_out(environment, params, actions):
     """Positions after each action, (steps, nq)."""
     return np.asarray(_rolled_out(environment, params, actions))
