@@ -11,7 +11,6 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from compiler import QUICKLY
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"peps_jax": ROOT / "peps_jax", "peps_envs": ROOT / "envs" / "peps_envs"}
@@ -26,7 +25,7 @@ SWEEP = """--env nav-d1 --seeds 1 --episodes 2 --total-steps 1024 --num-envs 4 -
 
 def python(*arguments: object, folder: Path, **environment: str) -> str:
     """What Python prints in `folder`, where nothing names the checkout and only packages that are needed are found."""
-    kept = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | {"XLA_FLAGS": QUICKLY}
+    kept = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "XLA_FLAGS")}
     command = [sys.executable, *map(str, arguments)]
     done = subprocess.run(
         command, cwd=folder, env=kept | environment, capture_output=True, text=True, encoding="utf-8", check=False
