@@ -5,16 +5,16 @@
 
 import os
 
-# before JAX starts; nearly all of a test's time is compilation, which optimizing would only prolong
-os.environ["XLA_FLAGS"] = (
-    f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
-    " --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-)
+from compiler import QUICKLY
+
+# before JAX starts
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2 {QUICKLY}"
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ["PEPS_JAX_CACHE"] = ""  # tests change code, of which what is kept knows nothing
 
 import dataclasses
 import functools
+import gc
 from typing import NamedTuple
 
 import distrax
@@ -33,6 +33,13 @@ from peps_jax.settings import Settings
 from peps_jax.train import init, prepare
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+gc.set_threshold(100_000, 20, 50)  # tracing makes many objects, and hardly any garbage that refers to itself
+
+
+def pytest_collection_finish() -> None:
+    """What was imported stays: the garbage collector doesn't look through it again and again."""
+    gc.freeze()
 
 
 def _lenient(function):

@@ -136,8 +136,16 @@ def memory_need(config: Config, num_episodes: int, recorded: PreferenceSet | Non
     of 64 and 256), and up to 23 % more where a chunk is a single round. Most of it are the minibatches of a round,
     updates_per_round * batch_size transitions.
     """
-    about = written(config, "memory", num_episodes, _shapes_of(recorded))
-    return compilation_cache.kept(about, lambda: {"need": _memory_need(config, num_episodes, recorded)})["need"]
+    shapes = _shapes_of(recorded)
+    key = structure(config), num_episodes, tuple(shapes)
+    if key not in _NEEDS:  # tracing takes seconds
+        about = written(config, "memory", num_episodes, shapes)
+        made = lambda: {"need": _memory_need(config, num_episodes, recorded)}
+        _NEEDS[key] = compilation_cache.kept(about, made)["need"]
+    return _NEEDS[key]
+
+
+_NEEDS: dict[Any, memory.Need] = {}  # predicted in this process
 
 
 def _memory_need(config: Config, num_episodes: int, recorded: PreferenceSet | None) -> memory.Need:

@@ -18,7 +18,7 @@ NAMES = peps_envs.names()
 
 @functools.cache
 def seen(name: str) -> tuple:
-    """What `judged_step` returned of a few random steps, and l and r under the truth and each belief."""
+    """A start, and what `judged_step` returned of a few random steps from there, and l and r under the truth and each belief."""
     task = peps_envs.make(name)
     environment, space = task.environment, task.environment.action_space
     whose = task.beliefs | {"truth": task.params}
@@ -43,7 +43,7 @@ def seen(name: str) -> tuple:
     @jax.jit
     def walk(key):
         state, observation = environment.reset(key, task.params)
-        return observation, jax.lax.scan(move, state, jax.random.split(key, STEPS))[1]
+        return (state, observation), jax.lax.scan(move, state, jax.random.split(key, STEPS))[1]
 
     return walk(jax.random.key(0))
 
@@ -51,7 +51,7 @@ def seen(name: str) -> tuple:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_step_returns_what_it_has_to(name):
     environment = peps_envs.make(name).environment
-    first, (after, *_) = seen(name)
+    (_, first), (after, *_) = seen(name)
     assert first.shape == (environment.observation_size,)
     assert after.observation.shape == (STEPS, environment.observation_size)
     assert after.events.shape == (STEPS, len(environment.event_names))
@@ -104,7 +104,7 @@ def test_densities_are_relative_to_the_kernel(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_what_there_is_to_see_is_of_known_colours(name):
     task = peps_envs.make(name)
-    state, _ = task.environment.reset(jax.random.key(0), task.params)
+    (state, _), _ = seen(name)
     scene = task.environment.scene(state, task.params)
     assert scene is None or isinstance(scene, Scene)
     shapes = () if scene is None else scene.shapes

@@ -89,7 +89,7 @@ def test_a_beliefs_step_knows_nothing_of_the_true_system(backend):
     key, push, moved = jax.random.key(0), jnp.ones(2), {}
     for name, system in (("true", env.sys), ("heavy", heavy)):
         state, _ = jax.jit(environment.reset)(key, system)
-        adopted = environment.adopted(state, heavy)
+        adopted = jax.jit(environment.adopted)(state, heavy)
         if name == "true" and backend != "mjx":
             assert not np.array_equal(mass_of(state.inner.pipeline_state), mass_of(adopted.inner.pipeline_state))
         after = jax.jit(environment.step)(key, adopted, push, heavy).state.inner.pipeline_state

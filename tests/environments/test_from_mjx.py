@@ -15,7 +15,7 @@ from peps_jax import Config
 mujoco = pytest.importorskip("mujoco")
 mjx = pytest.importorskip("mujoco.mjx")
 
-from mjx_cases import in_mujoco, rolled_out  # noqa: E402
+from mjx_cases import begun, in_mujoco, rolled_out, stepped  # noqa: E402
 
 from peps_envs.bridges.from_mjx import from_mjx  # noqa: E402
 
@@ -116,8 +116,9 @@ def test_random_steps_are_mjxs_bit_by_bit():
         with jax.numpy_rank_promotion("allow"):  # which MJX needs
             return mjx.step(model, data.replace(ctrl=action * jnp.array([1.0, 2.0])))
 
-    states = jax.vmap(lambda key: environment.reset(key, model)[0])(jax.random.split(jax.random.key(0), 200))
-    data = jax.vmap(lambda _: mjx.make_data(compiled(5.0), impl="jax"))(jnp.arange(200))
+    keys = jax.random.split(jax.random.key(0), 200)
+    states = jax.jit(jax.vmap(lambda key: environment.reset(key, model)[0]))(keys)
+    data = jax.jit(jax.vmap(lambda _: mjx.make_data(compiled(5.0), impl="jax")))(jnp.arange(200))
     for key in jax.random.split(jax.random.key(1), 100):
         action = jax.random.uniform(key, (200, 2), minval=-1.0)
         states, data = step(states, action).state, theirs(data, action)
@@ -128,17 +129,17 @@ def test_random_steps_are_mjxs_bit_by_bit():
 def test_what_is_seen_and_paid_is_of_the_pose_after_the_step():
     environment = push()
     model, action = environment.model(compiled(5.0)), jnp.array([1.0, 0.0])
-    step = jax.jit(lambda state: environment.step(jax.random.key(0), state, action, model))
-    state, observation = environment.reset(jax.random.key(0), model)
+    state, observation = begun(environment, model)
     assert observation.shape == (environment.observation_size,) == (8,)
     for _ in range(60):
-        before, state = state, step(state).state
+        before, state = state, stepped(environment, state, action, model).state
     ball = np.array([0.4, 0.02]) + state.inner.qpos[2:]
     assert ball[0] > 0.45
     np.testing.assert_allclose(environment.perceive(state), ball, rtol=1e-5)
     moved = state.inner.qpos[2] - before.inner.qpos[2]
     np.testing.assert_allclose(state.reward, moved - 0.01, atol=1e-5)
-    np.testing.assert_allclose(environment.reward(before, action, state, model), state.reward, atol=1e-6)
+    reward = jax.jit(environment.reward)(before, action, state, model)
+    np.testing.assert_allclose(reward, state.reward, atol=1e-6)
     (drawn,) = environment.scene(jax.device_get(state), model).shapes
     np.testing.assert_allclose([drawn.x, drawn.y, drawn.radius], [*ball, 0.15], rtol=1e-5)
 
@@ -147,19 +148,18 @@ def test_a_belief_expects_what_the_other_model_does():
     environment = push()
     heavy, light = (environment.model(compiled(mass)) for mass in (5.0, 1.0))
     action = jnp.array([1.0, 0.0])
-    step = jax.jit(lambda state, model: environment.step(jax.random.key(0), state, action, model).state)
 
     @jax.jit
     def surprise(state, after, model):
         return environment.next_state_distribution(state, action, model).relative_log_prob(environment.perceive(after))
 
-    judged = jax.jit(lambda state: environment.judged_step(jax.random.key(0), state, action, heavy, light)[1])
-    state, _ = environment.reset(jax.random.key(0), heavy)
+    judged_step = jax.jit(lambda state: environment.judged_step(jax.random.key(0), state, action, heavy, light))
+    state, _ = begun(environment, heavy)
     found = []
     for _ in range(60):
-        after = step(state, heavy)
-        found.append([surprise(state, after, heavy), surprise(state, after, light), judged(state).log_belief])
-        state = after
+        after, judged = judged_step(state)
+        found.append([*(surprise(state, after.state, model) for model in (heavy, light)), judged.log_belief])
+        state = after.state
     knows, believes, side_by_side = np.array(found).T
     assert np.all(knows > -1e-6)
     assert believes.min() < -0.01
@@ -180,9 +180,9 @@ def test_starts_and_ends_of_ones_own():
 
     environment = push(start=start, terminated=lambda data: data.qpos[0] < -0.4, substeps=3)
     model = environment.model(compiled(5.0))
-    (one, _), (other, _) = (environment.reset(jax.random.key(seed), model) for seed in (0, 1))
+    (one, _), (other, _) = (begun(environment, model, jax.random.key(seed)) for seed in (0, 1))
     assert one.inner.qpos[0] != other.inner.qpos[0]
-    after = jax.jit(environment.step)(jax.random.key(0), one, jnp.zeros(2), model)
+    after = stepped(environment, one, jnp.zeros(2), model)
     assert bool(after.terminated)
     np.testing.assert_allclose(after.state.inner.time, 0.03, rtol=1e-5)
 

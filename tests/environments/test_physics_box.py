@@ -8,7 +8,7 @@ import pytest
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.mjx")
 
-from mjx_cases import in_mujoco, rolled_out  # noqa: E402
+from mjx_cases import begun, in_mujoco, rolled_out  # noqa: E402
 
 import peps_envs  # noqa: E402
 from peps_envs.physics import box  # noqa: E402
@@ -107,8 +107,7 @@ def test_a_roll_out_is_mujocos_of_a_box_of_that_mass(task, mass):
     assert np.ptp(expected[:, 2]) > 0.1, "the box is pushed"
 
     with jax.enable_x64(True):
-        environment, *_ = box.domain()
-        found = rolled_out(environment, environment.model(compiled), actions)
+        found = rolled_out(task.environment, task.environment.model(compiled), actions)
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
@@ -123,7 +122,7 @@ def test_a_box_moves_as_its_weight_lets_it(routes):
 
 
 def test_what_there_is_to_see_is_in_view(task):
-    state, observation = task.environment.reset(jax.random.key(0), task.params)
+    state, observation = begun(task.environment, task.params)
     assert np.all(np.abs(observation) <= 1)
     scene = task.environment.scene(jax.device_get(state), task.params)
     left, right, low, high = scene.extent

@@ -11,7 +11,7 @@ from peps_envs.scene import Circle, Polyline, Rectangle
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.mjx")
 
-from mjx_cases import in_mujoco, rolled_out  # noqa: E402
+from mjx_cases import begun, in_mujoco, rolled_out  # noqa: E402
 
 from peps_envs.physics import ice  # noqa: E402
 
@@ -75,7 +75,7 @@ def test_steps_are_mujocos_with_that_friction(friction):
     expected = in_mujoco(compiled, actions, ice.SUBSTEPS, ice.START)
     assert expected[:, 0].max() > ice.SHORE[0] + 0.5
     with jax.enable_x64(True):
-        environment, _, _ = ice.domain()
+        environment = peps_envs.make("mjx-ice").environment
         exact = rolled_out(environment, environment.model(compiled), actions)
     np.testing.assert_allclose(exact, expected, atol=1e-6)
 
@@ -94,7 +94,7 @@ def test_on_ice_the_sled_loses_what_its_friction_takes():
 
 def test_the_scene_has_pond_goal_and_sled_in_view():
     task = peps_envs.make("mjx-ice")
-    state, observation = task.environment.reset(jax.random.key(0), task.params)
+    state, observation = begun(task.environment, task.params)
     assert observation.shape == (8,)
     assert np.abs(observation).max() <= 1
     scene = task.environment.scene(jax.device_get(state), task.params)

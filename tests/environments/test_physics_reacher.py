@@ -10,7 +10,7 @@ import pytest
 mujoco = pytest.importorskip("mujoco")
 pytest.importorskip("mujoco.mjx")
 
-from mjx_cases import in_mujoco, rolled_out  # noqa: E402
+from mjx_cases import begun, in_mujoco, rolled_out  # noqa: E402
 
 import peps_envs  # noqa: E402
 from peps_envs.physics import reacher  # noqa: E402
@@ -35,24 +35,26 @@ def over(state):
     return jnp.array([1.0, 0.0])
 
 
+@jax.jit
+def run(params, believed, upwards):
+    """The steps of an episode over the top or under the shoulder, and l_H of each."""
+    environment = peps_envs.make("mjx-reacher").environment
+
+    def step(state, _):
+        action = jnp.where(upwards, over(state), under(state))
+        after = environment.step(jax.random.key(0), state, action, params)
+        expected = environment.next_state_distribution(state, action, believed)
+        return after.state, (after, expected.relative_log_prob(environment.perceive(after.state)))
+
+    return jax.lax.scan(step, environment.reset(jax.random.key(0), params)[0], None, environment.horizon)[1]
+
+
 @functools.cache
 def walk(policy, belief="biased"):
     """The states of an episode, its return, l_H and length in steps, and whether it reached the goal."""
     task = peps_envs.make("mjx-reacher")
     environment = task.environment
-
-    @jax.jit
-    def run(params, believed):
-        def step(state, _):
-            action = policy(state)
-            after = environment.step(jax.random.key(0), state, action, params)
-            expected = environment.next_state_distribution(state, action, believed)
-            return after.state, (after, expected.relative_log_prob(environment.perceive(after.state)))
-
-        start, _ = environment.reset(jax.random.key(0), params)
-        return jax.lax.scan(step, start, None, environment.horizon)[1]
-
-    steps, log_belief = jax.device_get(run(task.params, task.beliefs[belief]))
+    steps, log_belief = jax.device_get(run(task.params, task.beliefs[belief], policy is over))
     reached = bool(steps.terminated.any())
     length = int(np.argmax(steps.terminated)) + 1 if reached else environment.horizon
     return steps.state, float(steps.reward[:length].sum()), float(log_belief[:length].sum()), length, reached
@@ -91,26 +93,30 @@ def test_who_knows_the_mass_is_never_surprised():
 
 
 @pytest.mark.parametrize("payload", [reacher.PAYLOAD, reacher.LOOKS, 24.0])
-def test_a_roll_out_is_mujocos_of_that_payload(payload):
+def test_a_roll_out_is_mujocos_of_that_payload(task, payload):
     steps = 100
     times = np.arange(steps)
     actions = np.stack([np.sin(times / 6), np.where(times % 20 < 10, 1.0, -1.0)], 1)
     compiled = reacher.model(payload)
     expected = in_mujoco(compiled, actions, reacher.SUBSTEPS)
     with jax.enable_x64(True):
-        environment, _, _ = reacher.domain()
-        places = rolled_out(environment, environment.model(compiled), actions)
+        places = rolled_out(task.environment, task.environment.model(compiled), actions)
     assert np.ptp(expected, axis=0).min() > 0.5, "both joints move"
     np.testing.assert_allclose(places, expected, atol=1e-6)
 
 
 def test_the_payloads_velocity_is_its_places_derivative(task):
     environment = task.environment
-    state, _ = environment.reset(jax.random.key(0), task.params)
+    state, _ = begun(environment, task.params)
     inner = state.inner._replace(qpos=jnp.array([0.7, -0.4]), qvel=jnp.array([1.5, -2.0]))
-    at = lambda qpos: reacher.place(environment._data(inner._replace(qpos=qpos), task.params))
-    _, speed = jax.jvp(at, (inner.qpos,), (inner.qvel,))
-    np.testing.assert_allclose(reacher.velocity(environment._data(inner, task.params)), speed, atol=1e-5)
+
+    @jax.jit
+    def both(inner):
+        at = lambda qpos: reacher.place(environment._data(inner._replace(qpos=qpos), task.params))
+        _, speed = jax.jvp(at, (inner.qpos,), (inner.qvel,))
+        return reacher.velocity(environment._data(inner, task.params)), speed
+
+    np.testing.assert_allclose(*both(inner), atol=1e-5)
 
 
 def test_the_scene_lies_within_its_extent(task):

@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -86,6 +87,7 @@ class FromMjx(Simulator):
         data = self._posed(data if self.begin is None else self.begin(key, data), params)
         return self._kept(data), self.observe(data)
 
+    @functools.partial(jax.jit, static_argnums=0)  # traced once, however often a program steps
     def advance(
         self, key: Array, inner: MjxState, action: Array, params: mjx.Model
     ) -> tuple[MjxState, Array, Array, Array]:
@@ -114,6 +116,7 @@ class FromMjx(Simulator):
         mujoco.mj_forward(self.compiled, data)
         return self.draw(self.compiled, data)
 
+    @functools.partial(jax.jit, static_argnums=0)
     def _data(self, inner: MjxState, params: mjx.Model) -> mjx.Data:
         data = mjx.make_data(self.compiled, impl="jax").replace(
             qpos=inner.qpos,
