@@ -152,7 +152,7 @@ sizes = dict(total_steps=40, num_envs=4, rollout_length=10, warmup_steps=0, batc
 configs = [Config(method="sac", seed=seed, **sizes) for seed in range(2)]
 (planned,) = batches.plan(configs, 2)
 if sys.argv[1] == "known":
-    program.Program._compile = None
+    program.Program._lowered = None
 compiled, _ = program.program(configs[0], planned.slots, 2, planned.devices)
 finished, _ = compiled.run(configs)
 print([one.evaluation.return_.tolist() for one in finished], compiled.bytes_used)

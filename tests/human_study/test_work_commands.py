@@ -24,9 +24,11 @@ from peps_jax.human_study.simulated_participants import Door, Eyes, Minds, Parti
 from peps_jax.settings import settings_of
 
 ENV = "nav-d1"
+# as in test_training.py, so that they share programs
 SMALL = """
 --total-steps 80 --num-envs 4 --rollout-length 10 --warmup-steps 0 --batch-size 8 --hidden-sizes 8 --model-hidden-sizes 8
---ensemble-size 2 --num-queries 4 --dynamics-updates 2 --surrogate-updates 2 --updates-per-step 0.1
+--ensemble-size 2 --num-queries 4 --dynamics-updates 2 --dynamics-batch-size 8 --surrogate-updates 2
+--surrogate-batch-size 8 --updates-per-step 0.1
 """.split()
 
 

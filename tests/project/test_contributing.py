@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from compiler import QUICKLY
 from test_layers import violations
 
 ROOT = Path(__file__).parents[2]
@@ -73,11 +74,9 @@ def add_line(path: Path, text: str, after: str = "") -> None:
 
 def run(root: Path, *command: object) -> subprocess.CompletedProcess:
     own = os.pathsep.join([str(root), str(root / "envs")])
-    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    flags = "--xla_backend_optimization_level=0"
     return subprocess.run(
         [sys.executable, *map(str, command)], cwd=root, capture_output=True, text=True, encoding="utf-8", check=False,
-        env=environment | {"PYTHONPATH": own, "XLA_FLAGS": flags, "PEPS_JAX_CACHE": ""},
+        env=os.environ | {"PYTHONPATH": own, "XLA_FLAGS": QUICKLY, "PEPS_JAX_CACHE": ""},
     )  # fmt: skip
 
 

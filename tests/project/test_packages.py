@@ -11,6 +11,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from compiler import QUICKLY
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"peps_jax": ROOT / "peps_jax", "peps_envs": ROOT / "envs" / "peps_envs"}
@@ -25,7 +26,7 @@ SWEEP = """--env nav-d1 --seeds 1 --episodes 2 --total-steps 1024 --num-envs 4 -
 
 def python(*arguments: object, folder: Path, **environment: str) -> str:
     """What Python prints in `folder`, where nothing names the checkout and only packages that are needed are found."""
-    kept = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "XLA_FLAGS")}
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | {"XLA_FLAGS": QUICKLY}
     command = [sys.executable, *map(str, arguments)]
     done = subprocess.run(
         command, cwd=folder, env=kept | environment, capture_output=True, text=True, encoding="utf-8", check=False

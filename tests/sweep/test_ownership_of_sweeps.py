@@ -214,7 +214,7 @@ def test_a_sweep_of_which_every_run_failed_says_so_by_its_exit_code(
 @pytest.mark.slow
 @pytest.mark.parametrize("by", ["--resume", "--overwrite"])
 def test_a_process_that_is_suspended_and_wakes_up_late(by, compiled, tmp_path):
-    flags = ["--env", "nav-d1", "--method", "sac", "--seeds", "2", "--total-steps", "4000", *SIZES]
+    flags = ["--env", "nav-d1", "--method", "sac", "--seeds", "2", "--total-steps", "1200", *SIZES]
     folder = tmp_path / "out"
     late = start(compiled, *flags, "--out", folder)
     while late.poll() is None and not list(folder.glob("progress/batch-00000/rounds-*")):
