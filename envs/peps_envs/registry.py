@@ -54,7 +54,8 @@ def make(name: str) -> Task:
     """
     if name not in _TASKS:
         raise ValueError(unknown_name("env", name, _TASKS))
-    return _TASKS[name]()
+    task = _TASKS[name]()
+    return task._replace(beliefs=dict(task.beliefs))  # a dictionary of the caller's own
 
 
 def unknown_name(field: str, name: str, known: Iterable[str]) -> str:
@@ -65,28 +66,34 @@ def unknown_name(field: str, name: str, known: Iterable[str]) -> str:
     return f"{field} {name!r} is unknown: {hint}known are {', '.join(known)}"
 
 
-def _navigation(domain: str) -> Callable[[], Task]:
-    return lambda: Task(navigation.Navigation(), *navigation.domain(domain))
+def _once(made: Callable[[], Task]) -> Callable[[], Task]:
+    """`made`, called once: many numbers become arrays, which takes a while, and a compiled MuJoCo model equals itself alone."""
 
-
-def _highway(domain: str) -> Callable[[], Task]:
-    return lambda: Task(highway.Highway(), *highway.domain(domain))
-
-
-def _physics(module: str) -> Callable[[], Task]:
-    # kept, because a compiled MuJoCo model equals itself alone; imported when it is asked for, because MuJoCo takes a second
     @functools.cache
-    def made(double_precision: bool) -> Task:
+    def of(double_precision: bool) -> Task:
         del double_precision  # which its parameters are of
         with jax.ensure_compile_time_eval():  # a task may be made while a training is traced
-            return Task(*importlib.import_module(f"peps_envs.physics.{module}").domain())
+            return made()
 
-    return lambda: made(jax.config.jax_enable_x64)
+    return lambda: of(jax.config.jax_enable_x64)
+
+
+def _navigation(domain: str) -> Task:
+    return Task(navigation.Navigation(), *navigation.domain(domain))
+
+
+def _highway(domain: str) -> Task:
+    return Task(highway.Highway(), *highway.domain(domain))
+
+
+def _physics(module: str) -> Task:
+    # imported when it is asked for, because MuJoCo takes a second
+    return Task(*importlib.import_module(f"peps_envs.physics.{module}").domain())
 
 
 for _domain in navigation.DOMAINS:
-    register(f"nav-{_domain}", _navigation(_domain))
+    register(f"nav-{_domain}", _once(functools.partial(_navigation, _domain)))
 for _domain in highway.DOMAINS:
-    register(f"highway-{_domain}", _highway(_domain))
+    register(f"highway-{_domain}", _once(functools.partial(_highway, _domain)))
 for _module in PHYSICS:
-    register(f"mjx-{_module}", _physics(_module))
+    register(f"mjx-{_module}", _once(functools.partial(_physics, _module)))

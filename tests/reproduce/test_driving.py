@@ -233,6 +233,14 @@ def test_the_studys_own_way_has_all_seeds_and_variants_few(monkeypatch):
     assert len(experiment.parts(seeds, 80)) == 2
 
 
+def test_variants_are_told_by_what_they_differ_in():
+    own = experiment.OWN
+    tried = {experiment.Variant(lam=8.0): "long", own: "own", experiment.Variant(each=20): "few"}
+    findings = experiment.Findings(scenes={}, conduct={}, variants=tried, groups=[], wider=[])
+    assert findings.over("lam") == {own.lam: "own", 8.0: "long"}
+    assert findings.over("each") == {20: "few", own.each: "own"}
+
+
 def test_fewer_answers_are_the_first_of_everybody(given):
     (pairs, all_given), (same, few) = given, compare(jax.random.key(3), 3)
     place = np.arange(len(all_given.weight)) % comparisons.ANSWERS
@@ -250,7 +258,7 @@ def test_a_small_study_from_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(experiment, "EPISODES", 8)
     monkeypatch.setattr(experiment, "METHODS", ("peps", "sac"))
     monkeypatch.setattr(experiment, "LAMS", ())
-    monkeypatch.setattr(experiment, "EACH", (1, experiment.OWN.each))
+    monkeypatch.setattr(experiment, "EACH", ())
     monkeypatch.setattr(experiment, "findings", functools.partial(experiment.findings, number=3))
     arguments = ["figure3", "--seeds", "2", "--steps", "80", "--out", str(tmp_path)]
     assert command.main(arguments) == 0
@@ -259,7 +267,7 @@ def test_a_small_study_from_end_to_end(tmp_path, monkeypatch, capsys):
     numbers = json.loads((tmp_path / report.NUMBERS).read_text(encoding="utf-8"))
     assert set(numbers["ratings"]["mean"]) == {"peps", "sac"}
     assert [line["lam"] for line in numbers["over_lam"]] == [experiment.OWN.lam]
-    assert [line["each"] for line in numbers["over_each"]] == [1, experiment.OWN.each]
+    assert [line["each"] for line in numbers["over_each"]] == [experiment.OWN.each]
     assert (tmp_path / report.TABLE).read_text(encoding="utf-8") in capsys.readouterr().out
 
 
