@@ -8,14 +8,7 @@ The same simulator is stepped in every way of `WAYS`; what changes is how many s
 from __future__ import annotations
 
 import argparse
-import os
 import pathlib
-
-if __name__ == "__main__":  # a device for every core, as a sweep has them
-    os.environ["XLA_FLAGS"] = (
-        os.environ.get("XLA_FLAGS", "") + f" --xla_force_host_platform_device_count={os.cpu_count()}"
-    )
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import jax
 import numpy as np
@@ -23,6 +16,7 @@ import physics
 
 from peps_jax import Config
 from peps_jax.analysis.intervals import interquartile_mean
+from peps_jax.command_line import use_every_core
 from peps_jax.execution.program import program
 from peps_jax.reproduce.physics import SETTINGS
 from peps_jax.storage.tables import markdown
@@ -68,6 +62,7 @@ def main() -> None:
     parser.add_argument("--env", default=physics.TASKS[0])
     parser.add_argument("--seeds", type=int, default=6)
     args = parser.parse_args()
+    use_every_core()
     rows = [row(args.env, way, changes, args.seeds) for way, changes in WAYS.items()]
     head = ["task", "PEPS", "steps a second", "of the physics", "seconds", "arrive", "return", "explicability"]
     text = f"{markdown(head, rows)}\n{_NOTE.format(devices=jax.device_count(), seeds=args.seeds, episodes=EPISODES)}"

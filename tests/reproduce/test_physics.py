@@ -88,7 +88,7 @@ def two_tasks(monkeypatch):
     monkeypatch.setattr(registry, "_TASKS", dict(registry._TASKS))
     for name, numbers in {"sled": (0.2, 0.3), "slow": (0.1, 0.3)}.items():
         monkeypatch.setitem(sys.modules, f"{tasks.__name__}.{name}", module(*numbers))
-        registry.register(f"mjx-{name}", functools.partial(registry._physics, name))
+        registry.register(f"mjx-{name}", registry._once(functools.partial(registry._physics, name)))
     monkeypatch.setattr(physics, "TASKS", ("mjx-sled", "mjx-slow"))
     monkeypatch.setattr(panels, "DOTS", 30)
 
