@@ -94,6 +94,9 @@ class Config:
     total_steps: int = static(20_000, COUNT, "environment steps in all", group="run")
     num_envs: int = static(16, COUNT, "environments side by side", group="run")
     rollout_length: int = static(25, COUNT, "steps that each environment makes in a round", group="run")
+    watched_every: int = static(
+        1, COUNT, "of how many environments the human watches one, to be asked about and to judge", group="run"
+    )
     warmup_steps: int = static(
         4_800, COUNT_OR_NONE, "environment steps with uniformly random actions at the start", group="run"
     )
@@ -242,6 +245,11 @@ class Config:
             if field.metadata.get("pytree_node", True):
                 check_single(field, getattr(self, field.name))
         _check_problem(self.problem())
+        if self.num_envs % self.watched_every:
+            raise ValueError(
+                f"watched_every {self.watched_every} doesn't divide the environments: "
+                f"num_envs is {self.num_envs}; choose a divisor of that"
+            )
         if self.segment_length > self.rollout_length:
             raise ValueError(
                 f"segment_length {self.segment_length} is longer than what a round collects: "

@@ -49,9 +49,25 @@ class Score(NamedTuple):
 def judged_step(problem: Problem, key: Array, state: Any, action: Array) -> tuple[peps_envs.Step, Score, Array]:
     """One step of the true dynamics; its score, every field of which is () float32; and what the human imagines, as perceived."""
     after, judged = problem.environment.judged_step(key, state, action, problem.params, problem.belief)
-    score = Score(after.reward, judged.human_reward, judged.log_belief, judged.log_true)
+    score = _score(after.reward, judged)
     chex.assert_shape(list(score), ())
-    return after, Score(*(jnp.asarray(value, jnp.float32) for value in score)), judged.imagined
+    return after, score, judged.imagined
+
+
+def judged_steps(
+    problem: Problem, keys: Array, states: Any, actions: Array, watched: int
+) -> tuple[peps_envs.Step, Score, Array]:
+    """The same of n environments side by side (n, ...), of which the human watches the first: scores are (watched,)."""
+    after, judged = problem.environment.judged_steps(keys, states, actions, problem.params, problem.belief, watched)
+    chex.assert_shape([after.reward, after.terminated, after.truncated], actions.shape[:1])
+    score = _score(after.reward[:watched], judged)
+    chex.assert_shape(list(score), (watched,))
+    return after, score, judged.imagined
+
+
+def _score(reward: Array, judged: peps_envs.Judgement) -> Score:
+    worth = (reward, judged.human_reward, judged.log_belief, judged.log_true)
+    return Score(*(jnp.asarray(value, jnp.float32) for value in worth))
 
 
 def score(problem: Problem, state: Any, action: Array, next_state: Any) -> Score:

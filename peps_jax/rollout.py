@@ -20,7 +20,7 @@ from peps_jax.trajectory import Trajectory, Transition
 
 
 class Running(NamedTuple):
-    """Sums over the episodes that are under way, (num_envs,) each."""
+    """Sums over the episodes that are under way, (watched_envs,) each."""
 
     score: Score
     length: Array
@@ -39,7 +39,7 @@ def init(key: Array, problem: Problem, settings: RolloutSettings) -> Actors:
     """All environments at their start."""
     reset = jax.vmap(problem.environment.reset, in_axes=(0, None))
     state, observation = reset(jax.random.split(key, settings.num_envs), problem.params)
-    zeros = jnp.zeros(settings.num_envs, jnp.float32)
+    zeros = jnp.zeros(settings.watched_envs, jnp.float32)
     return Actors(state, _seen(observation), Running(Score(zeros, zeros, zeros, zeros), zeros))
 
 
@@ -91,11 +91,11 @@ def collect(
     Returns:
       actors: where the environments stand now.
       trajectory: all transitions, each with its own last observation, never the next episode's first.
-      info: means over the episodes that ended in this round, and their number, `episodes`; where that is 0 they are 0.
+      info: means over the watched episodes that ended in this round, and their number, `episodes`; where that is 0 they are 0.
     """
     environment, params = problem.environment, problem.params
     reset = jax.vmap(environment.reset, in_axes=(0, None))
-    step = jax.vmap(lambda key, state, action: explicability.judged_step(problem, key, state, action))
+    told = settings.watched_envs == settings.num_envs
     split = lambda key: jax.random.split(key, settings.num_envs)
 
     def step_all(
@@ -106,8 +106,9 @@ def collect(
         key_act, key_env, key_reset = jax.random.split(key, 3)
         action = act(observation, key_act, time)
         chex.assert_axis_dimension(action, 0, settings.num_envs)
-        after, score, imagined = step(split(key_env), state, action)
-        chex.assert_shape([after.reward, after.terminated, after.truncated], (settings.num_envs,))
+        after, score, imagined = explicability.judged_steps(
+            problem, split(key_env), state, action, settings.watched_envs
+        )
         seen, over = _seen(after.observation), after.terminated | after.truncated
         start, first = reset(split(key_reset), params)
         restart = lambda new, old: jax.vmap(jnp.where)(over, new, old)
@@ -120,8 +121,8 @@ def collect(
             next_observation=seen,
             movement=moved,
             terminated=after.terminated,
-            human_reward=score.human_return,
-            log_belief=score.log_belief,
+            human_reward=score.human_return if told else None,
+            log_belief=score.log_belief if told else None,
             imagined=move_in_mind(state, imagined, problem) if settings.imagines else None,
         )
         row = Trajectory(transition, after.truncated, after.events, score.worth, state, after.state)
@@ -132,13 +133,14 @@ def collect(
     (state, observation), (trajectory, scores) = jax.lax.scan(
         step_all, (actors.state, actors.observation), (times, keys)
     )
-    over = trajectory.transition.terminated | trajectory.truncated
+    watched = lambda rows: rows[:, : settings.watched_envs]
+    over = watched(trajectory.transition.terminated | trajectory.truncated)
     values = Running(scores, jnp.ones_like(scores.return_))
     totals, running = explicability.episode_sums(values, over, actors.running)
     return (
         Actors(state=state, observation=observation, running=running),
         trajectory,
-        _episode_means(totals, over, trajectory.events, environment.event_names),
+        _episode_means(totals, over, watched(trajectory.events), environment.event_names),
     )
 
 

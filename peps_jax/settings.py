@@ -54,7 +54,17 @@ class RolloutSettings:
     length: int = _static()  # steps of each environment in a round
     hold_steps: int = _static()  # for which a random action is held
     exploration: Array  # share of the steps with random actions
+    watched_every: int = _static(default=1)  # of how many environments the human watches one
     imagines: bool = _static(default=False)  # whether what the human imagines is kept, for a method that learns from it
+
+    @property
+    def watched_envs(self) -> int:
+        """Environments that the human watches, the first ones."""
+        return self.num_envs // self.watched_every
+
+    def watching_all(self) -> RolloutSettings:
+        """For a method that is told what the human thinks of every step."""
+        return self.replace(watched_every=1)
 
 
 @struct.dataclass

@@ -139,7 +139,13 @@ def _untaught(training: Training) -> TrainingState:
         knowledge=method.init(key_knowledge, settings),
         preferences=None,
         budget=None,
-        replay=replay.init(capacity, *spaces, settings.dynamics.perceived_size, settings.rollout.imagines),
+        replay=replay.init(
+            capacity,
+            *spaces,
+            settings.dynamics.perceived_size,
+            told=settings.rollout.watched_envs == settings.rollout.num_envs,
+            imagines=settings.rollout.imagines,
+        ),
         actors=rollout.init(key_actors, training.problem, settings.rollout),
         key=key,
     )

@@ -16,9 +16,9 @@ class Transition(NamedTuple):
     next_observation: Array  # (..., observation_size), of the last step too, not of the next episode's start
     movement: Array  # (..., perceived_size) of the perceived state in the step, in units of sigma_p: what T_A predicts
     terminated: Array  # (...) bool: the MDP ended; False where only time ran out
-    # what nobody knows but the yardsticks, the oracle and DARC
-    human_reward: Array  # (...) r_H
-    log_belief: Array  # (...) l_H
+    # what nobody knows but the yardsticks, the oracle and DARC; None where the human doesn't watch every environment
+    human_reward: Array | None  # (...) r_H
+    log_belief: Array | None  # (...) l_H
     imagined: Array | None = (
         None  # (..., perceived_size) the movement that the human imagines, where a method learns from it
     )
@@ -30,6 +30,6 @@ class Trajectory(NamedTuple):
     transition: Transition
     truncated: Array  # (steps, num_envs) bool
     events: Array  # (steps, num_envs, len(event_names)) bool
-    worth: Array  # (steps, num_envs, 2) what a synthetic human with the belief, and one who knows the truth, think of a step
+    worth: Array  # (steps, watched_envs, 2) what a synthetic human with the belief, and one who knows the truth, think of a step
     state: Any
     next_state: Any

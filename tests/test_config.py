@@ -34,6 +34,7 @@ WRONG = [
     ("hidden_sizes", (8, 0), "whole numbers from 1 to"),
     ("model_hidden_sizes", (-1,), "whole numbers from 1 to"),
     ("segment_length", 11, "10"),
+    ("watched_every", 3, "4"),
     ("min_segment_length", 6, "5"),
     ("candidates_per_query", 9, "10 or more"),
     ("lam", -0.5, "0 or more"),

@@ -261,6 +261,30 @@ def test_the_temperature_fades_geometrically(line):
     assert at(9) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("method", ["peps", "oracle", "darc"])
+def test_what_the_human_watches_is_asked_about_and_reported(line, method):
+    """Nothing else changes: the same is done, and seen by the agent. Who is told of every step watches all."""
+
+    def first_round(watched_every):
+        training = prepare(line.replace(method=method, watched_every=watched_every, rollout_length=20))
+        state = init(training)
+        now = round_at(jnp.asarray(0), state.key, training.settings.schedule)
+        state, queries, info = jax.jit(collect_and_ask)(state, now, training)
+        rows = jax.tree.map(lambda rows: rows[: 20 * line.num_envs].reshape(20, line.num_envs, -1), state.replay)
+        return rows, queries, info
+
+    (rows, _, whole), (seen, queries, info) = first_round(1), first_round(2)
+    np.testing.assert_allclose(seen.next_observation, rows.next_observation, rtol=1e-6)
+    if method != "peps":
+        np.testing.assert_allclose(seen.log_belief, rows.log_belief, rtol=1e-6)
+        return
+    assert seen.log_belief is seen.human_reward is None
+    watched = rows.observation[:, : line.num_envs // 2]
+    assert np.isin(queries.segments.observation, watched).all()
+    over = seen.terminated[:, : line.num_envs // 2, 0] | (seen.next_observation[:, : line.num_envs // 2, 0] > 0.25)
+    assert 0 < np.sum(over) <= info["episodes"] < whole["episodes"]
+
+
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_exploring_environments_hold_random_actions(line, share):
     config = line.replace(warmup_steps=0, exploration=share, hold_steps=5)

@@ -138,10 +138,30 @@ class Environment(abc.ABC):
         human_reward = self.reward(state, action, after.state, belief)
         return after, Judgement(human_reward, log_belief, log_true, imagined)
 
+    def judged_steps(
+        self, keys: Array, states: Any, actions: Array, params: Any, belief: Any, watched: int
+    ) -> tuple[Step, Judgement]:
+        """A step of each of n environments side by side, and what the human thinks of those in the first `watched` of them.
+
+        All arguments but the parameters have a leading axis of n; so has what happened, (n, ...). Judgements are (watched, ...).
+        """
+        judge = lambda key, state, action: self.judged_step(key, state, action, params, belief)
+        after, judged = jax.vmap(judge)(*first(watched, (keys, states, actions)))
+        if watched == actions.shape[0]:
+            return after, judged
+        others = jax.tree.map(lambda rows: rows[watched:], (keys, states, actions))
+        unseen = jax.vmap(lambda key, state, action: self.step(key, state, action, params))(*others)
+        return jax.tree.map(lambda *rows: jnp.concatenate(rows), after, unseen), judged
+
     def scene(self, state: Any, params: Any) -> Scene | None:
         """What there is to see of `state`; None of an environment that has no picture. NumPy in, plain Python out: not traced."""
         del state, params
         return None
+
+
+def first(number: int, tree: Any) -> Any:
+    """The first `number` rows of every leaf."""
+    return jax.tree.map(lambda rows: rows[:number], tree)
 
 
 def side_by_side(*params: Any) -> Any:

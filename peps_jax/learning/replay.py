@@ -16,9 +16,15 @@ from peps_jax.trajectory import Transition
 
 
 def init(
-    capacity: int, observation_size: int, action_space: ActionSpace, perceived_size: int, imagines: bool = False
+    capacity: int,
+    observation_size: int,
+    action_space: ActionSpace,
+    perceived_size: int,
+    *,
+    told: bool = True,
+    imagines: bool = False,
 ) -> Transition:
-    """An empty buffer of `capacity` transitions."""
+    """An empty buffer of `capacity` transitions, with what the human thinks of each if that is `told`, and what it `imagines`."""
     numbers = lambda *shape: jnp.zeros((capacity, *shape), jnp.float32)
     discrete = isinstance(action_space, Discrete)
     return Transition(
@@ -28,8 +34,8 @@ def init(
         next_observation=numbers(observation_size),
         movement=numbers(perceived_size),
         terminated=jnp.zeros(capacity, bool),
-        human_reward=numbers(),
-        log_belief=numbers(),
+        human_reward=numbers() if told else None,
+        log_belief=numbers() if told else None,
         imagined=numbers(perceived_size) if imagines else None,
     )
 

@@ -60,7 +60,7 @@ def well_taught(settings: Settings) -> Settings:
         hidden_sizes=settings.agent.hidden_sizes,
         learning_rate=settings.agent.learning_rate,
     )
-    return settings.replace(rollout=settings.rollout.replace(imagines=True), dynamics=size_and_pace)
+    return settings.replace(rollout=settings.rollout.watching_all().replace(imagines=True), dynamics=size_and_pace)
 
 
 DARC = register(

@@ -46,11 +46,17 @@ def reward(knowledge: Knowledge, transitions: Transition, settings: Settings) ->
     return peps.objective(knowledge.dynamics, transitions, told, settings)
 
 
+def watching(settings: Settings) -> Settings:
+    """Told what the human thinks of every step."""
+    return settings.replace(rollout=settings.rollout.watching_all())
+
+
 ORACLE = register(
     Method(
         name="oracle",
         rewards=(reward,),
         uses_lam=True,
+        settings=watching,
         init=init,
         learn=learn,
         entropy_weight=peps.entropy_weight,

@@ -23,13 +23,13 @@ from peps_jax.trajectory import Trajectory
 def candidates(trajectory: Trajectory, key: Array, settings: QuerySettings) -> Segments:
     """Pairs of segments from `trajectory` (steps, num_envs, ...): (per_round * candidates_per_query, 2, steps, ...).
 
-    Starts and environments are uniform, lengths uniform from `min_segment_length` to `segment_length`; a segment ends earlier
+    Starts and watched environments are uniform, lengths uniform from `min_segment_length` to `segment_length`; a segment ends earlier
     where its episode does.
     """
-    steps, num_envs = trajectory.truncated.shape
+    steps, watched_envs = trajectory.worth.shape[:2]
     shape = (settings.per_round * settings.candidates_per_query, 2)
     key_env, key_start, key_length = jax.random.split(key, 3)
-    env = jax.random.randint(key_env, shape, 0, num_envs, jnp.int32)[..., None]
+    env = jax.random.randint(key_env, shape, 0, watched_envs, jnp.int32)[..., None]
     start = jax.random.randint(key_start, shape, 0, steps - settings.segment_length + 1, jnp.int32)[..., None]
     length = jax.random.randint(key_length, shape, settings.min_segment_length, settings.segment_length + 1, jnp.int32)[
         ..., None

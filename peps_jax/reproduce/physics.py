@@ -55,9 +55,14 @@ ABOUT = "tasks on MuJoCo models, of which the human believes another one"
 TASKS = tuple(f"mjx-{module}" for module in registry.PHYSICS)
 METHODS = ("peps", *BASELINES, "oracle", "darc")
 SHOWN = ("sac", "peps")  # in pictures, and judged by humans of other beliefs
-# Changes of the plan's settings that a task needs, by its name, for methods that learn T_A. At the defaults' pace T_A isn't sure
-# yet how a sled moves when the policy settles, and H_T pays for staying where it isn't
-SETTINGS: dict[str, dict[str, Any]] = {"mjx-ice": {"dynamics_learning_rate": 3e-3}}
+# Changes of the plan's settings by task, for methods that learn T_A. Where a step takes long, learning keeps pace with the physics:
+# the belief is stepped in every fourth environment, and every network has fewer updates for a step. T_A learns at the policy's
+# rate there: at the default one it isn't sure yet how things move when the policy settles, and H_T pays for staying where it isn't
+_KEEPING_PACE = {"watched_every": 4, "dynamics_learning_rate": 3e-3}
+SETTINGS: dict[str, dict[str, Any]] = {
+    "mjx-box": _KEEPING_PACE | {"updates_per_step": 0.2, "dynamics_updates": 8, "surrogate_updates": 16},
+    "mjx-ice": _KEEPING_PACE | {"updates_per_step": 0.25, "dynamics_updates": 10, "surrogate_updates": 20},
+}
 LEARN_DYNAMICS = ("peps", "oracle")
 
 FACTORS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)  # of the true quantity, to be believed

@@ -166,6 +166,26 @@ def test_a_belief_expects_what_the_other_model_does():
     np.testing.assert_allclose(side_by_side, believes, rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.parametrize("watched", [1, 3])
+def test_what_is_watched_is_judged_in_one_batch(watched):
+    """Three balls side by side end where each ends alone, and are judged as each is."""
+    environment = push()
+    heavy, light = (environment.model(compiled(mass)) for mass in (5.0, 1.0))
+    keys, actions = jax.random.split(jax.random.key(0), 3), jnp.array([[1.0, 0.0], [0.0, 1.0], [0.6, 0.2]])
+    states, _ = jax.vmap(environment.reset, in_axes=(0, None))(keys, heavy)
+    together = jax.jit(lambda states: environment.judged_steps(keys, states, actions, heavy, light, watched))
+    alone = jax.jit(jax.vmap(lambda *told: environment.judged_step(*told, heavy, light)))
+    surprises = []
+    for _ in range(60):
+        (after, judged), (own, each) = together(states), alone(keys, states, actions)
+        np.testing.assert_allclose(after.state.inner.qpos, own.state.inner.qpos, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(judged.log_belief, each.log_belief[:watched], rtol=1e-3, atol=1e-5)
+        np.testing.assert_allclose(judged.imagined, each.imagined[:watched], rtol=1e-4, atol=1e-4)
+        states = own.state
+        surprises.append(judged.log_belief)
+    assert np.min(surprises, 0)[0] < -0.01
+
+
 @pytest.mark.long
 def test_a_training_with_a_belief(train):
     environment = push()

@@ -117,6 +117,14 @@ def test_candidates_are_pieces_of_one_environment(line):
     assert set(np.unique(pairs.observation[:, :, 0] // 100)) == {0, 1, 2}
 
 
+def test_candidates_come_from_watched_environments_only(line):
+    config = settings(line.replace(num_queries=400)).queries
+    trajectory = collected()
+    trajectory = trajectory._replace(worth=trajectory.worth[:, :2])
+    pairs = jax.jit(queries.candidates)(trajectory, jax.random.key(0), config)
+    assert set(np.unique(pairs.observation[:, :, 0] // 100)) == {0, 1}
+
+
 @pytest.mark.parametrize("kind", ["terminated", "truncated"])
 def test_a_candidate_ends_with_its_episode(line, kind):
     config = settings(line.replace(num_queries=400, min_segment_length=5)).queries

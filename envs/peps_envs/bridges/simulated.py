@@ -17,7 +17,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from peps_envs.environment import ActionSpace, Bounds, Discrete, Environment, Judgement, Step, side_by_side
+from peps_envs.environment import ActionSpace, Bounds, Discrete, Environment, Judgement, Step, first, side_by_side
 from peps_envs.perception import Gaussian, PerceivedDensity
 
 
@@ -116,12 +116,40 @@ class Simulator(Environment):
         both = jax.vmap(step)(states, side_by_side(params, belief))
         of = lambda which: jax.tree.map(lambda rows: rows[which], both)
         after, imagined = of(0), of(1)
+        return after, self._judgement(key, state, action, after, imagined, belief)
+
+    def judged_steps(
+        self, keys: Array, states: SimulatedState, actions: Array, params: Any, belief: Any, watched: int
+    ) -> tuple[Step, Judgement]:
+        """One batch of n steps in truth and `watched` in the belief, each row with its own parameters.
+
+        Quicker than two batches side by side, each with parameters of its own: MuJoCo's box takes two thirds of the time.
+        """
+        if self.random_draws > 1:
+            return super().judged_steps(keys, states, actions, params, belief, watched)
+        number = actions.shape[0]
+        seen = first(watched, (keys, states, actions))
+        imagining = jax.vmap(self.adopted, in_axes=(0, None))(seen[1], belief)
+        batch = jax.tree.map(
+            lambda *rows: jnp.concatenate(rows), (keys, states, actions), (seen[0], imagining, seen[2])
+        )
+        believes = jnp.arange(number + watched) >= number
+        rows = jax.tree.map(lambda leaf: leaf[believes.astype(jnp.int32)], side_by_side(params, belief))
+        stepped = jax.vmap(self.step)(*batch, rows)
+        after, imagined = first(number, stepped), jax.tree.map(lambda rows: rows[number:], stepped)
+        judge = jax.vmap(self._judgement, in_axes=(0, 0, 0, 0, 0, None))
+        return after, judge(*seen, first(watched, after), imagined, belief)
+
+    def _judgement(
+        self, key: Array, state: SimulatedState, action: Array, after: Step, imagined: Step, belief: Any
+    ) -> Judgement:
+        """Of a step without chance, which the human imagined to end in `imagined`."""
         expected = self.perceive(imagined.state)
         density = Gaussian(expected, jnp.zeros_like(expected), self.perception_width(belief))
         log_belief = density.relative_log_prob(self.perceive(after.state))
         human_reward = self.reward(state, action, after.state, belief)
         drawn = density.sample(jax.random.fold_in(key, 1))
-        return after, Judgement(human_reward, log_belief, jnp.zeros_like(log_belief), drawn)
+        return Judgement(human_reward, log_belief, jnp.zeros_like(log_belief), drawn)
 
     def next_state_distribution(self, state: SimulatedState, action: Array, params: Any) -> PerceivedDensity:
         return super().next_state_distribution(self.adopted(state, params), action, params)
