@@ -23,8 +23,8 @@ from peps_jax.trajectory import Trajectory
 def candidates(trajectory: Trajectory, key: Array, settings: QuerySettings) -> Segments:
     """Pairs of segments from `trajectory` (steps, num_envs, ...): (per_round * candidates_per_query, 2, steps, ...).
 
-    Starts and watched environments are uniform, lengths uniform from `min_segment_length` to `segment_length`; a segment ends earlier
-    where its episode does.
+    Starts and watched environments are uniform, lengths uniform from `min_segment_length` to `segment_length`; a segment ends
+    earlier where its episode does.
     """
     steps, watched_envs = trajectory.worth.shape[:2]
     shape = (settings.per_round * settings.candidates_per_query, 2)
