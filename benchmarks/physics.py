@@ -1,4 +1,4 @@
-"""Physics tasks: PEPS beside the physics alone, and beside SAC; writes benchmarks/results/physics_speed.md.
+"""Physics tasks: PEPS, set as in the evaluation, beside the physics alone and SAC; writes benchmarks/results/physics_speed.md.
 
     python benchmarks/physics.py [--envs mjx-box ...]
 
@@ -9,14 +9,7 @@ physics makes alone is measured in the same process as the trainings.
 from __future__ import annotations
 
 import argparse
-import os
 import pathlib
-
-if __name__ == "__main__":  # a device for every core, as a sweep has them
-    os.environ["XLA_FLAGS"] = (
-        os.environ.get("XLA_FLAGS", "") + f" --xla_force_host_platform_device_count={os.cpu_count()}"
-    )
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import environments
 import jax
@@ -25,8 +18,10 @@ import timing
 
 from peps_envs import registry
 from peps_jax import Config
+from peps_jax.command_line import use_every_core
 from peps_jax.execution.devices import stack
 from peps_jax.execution.program import advance, begin, shared
+from peps_jax.reproduce.physics import SETTINGS
 from peps_jax.storage.tables import markdown
 
 OUT = pathlib.Path(__file__).parent / "results" / "physics_speed.md"
@@ -35,8 +30,7 @@ ROUNDS = 10  # of a training that are timed
 STEPS = 500  # of the physics alone
 _NOTE = """\
 Environment steps a second on {devices} devices, {number} environments on each; the physics alone is measured before and after
-the trainings. A training steps truth and belief side by side: where two steps cost twice as much as one, the physics allows it
-half of its own rate at most.
+the trainings. PEPS steps the belief besides where the human watches, and SAC has as many updates for a step as PEPS.
 """
 
 
@@ -60,8 +54,10 @@ def training(config: Config) -> tuple[float, float]:
 
 def row(env: str) -> list[str]:
     """A task's line of the table."""
-    before = alone(env, Config().num_envs)
-    (sac, sac_compiles), (peps, peps_compiles) = (training(Config(env=env, method=name)) for name in ("sac", "peps"))
+    before, settings = alone(env, Config().num_envs), SETTINGS.get(env, {})
+    (sac, sac_compiles), (peps, peps_compiles) = (
+        training(Config(env=env, method=name, **settings)) for name in ("sac", "peps")
+    )
     physics = (before + alone(env, Config().num_envs)) / 2
     return [env, f"{physics:,.0f}", f"{sac:,.0f}", f"{peps:,.0f}", f"{peps / physics:.0%}", f"{peps / sac:.0%}",
             f"{sac_compiles:.0f}", f"{peps_compiles:.0f}", f"{peps_compiles / sac_compiles:.1f}"]  # fmt: skip
@@ -70,7 +66,9 @@ def row(env: str) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--envs", nargs="+", default=list(TASKS))
-    rows = [row(env) for env in parser.parse_args().envs]
+    args = parser.parse_args()
+    use_every_core()
+    rows = [row(env) for env in args.envs]
     head = [
         "task",
         "physics alone",

@@ -35,6 +35,7 @@ ROWS: dict[str, tuple[str, dict[str, Any]]] = {  # method, and what it is change
     "policy_shaping": ("policy_shaping", {}),
     "policy shaping, Gaussians": ("policy_shaping", {"product": "gaussians"}),
     "oracle": ("oracle", {}),
+    "darc": ("darc", {}),
     "human_expectation": ("human_expectation", {}),
 }
 # Gong and Zhang 2021, Table 1, in the order of `DOMAINS`: averages over 100 rollouts, without intervals
@@ -57,7 +58,7 @@ _NOTE = """\
 bootstrap interval; {episodes} episodes a seed by the policy's mode, "sampled" by its samples. Way: how many seeds go as in the
 paper's Figure 2, and the way of the planner. Paper: Gong and Zhang 2021, Table 1. The planner knows dynamics, belief and rewards;
 "peps" is Eq. (6) at λ = {lam:g}. "human" acts, and is scored, in the MDP that the human believes in. The oracle is told ℓ_H + r_H
-in r̂'s place.
+in r̂'s place, and DARC may step the dynamics that the human believes in.
 """
 
 
