@@ -39,6 +39,8 @@ def ways(env: str) -> dict[str, dict[str, float]]:
         "next to no updates, the belief stepped everywhere": HARDLY,
         "next to no updates": table | HARDLY,
     }
+
+
 _NOTE = """\
 Rates are environment steps a second of whole trainings on {devices} devices, compilation apart; "of the physics" compares with
 what the physics alone makes with as many environments, before and after. "Seconds" are those of one training on one core. Scores
@@ -52,7 +54,7 @@ def row(env: str, way: str, changes: dict[str, float], seeds: int) -> list[str]:
     configs = [config.replace(seed=seed) for seed in range(seeds)]
     before = physics.alone(env, config.num_envs)
     compiled, _ = program(config, seeds, EPISODES, tuple(jax.devices()))
-    runs, times = compiled.run(configs)
+    runs, times = compiled.run(configs, EPISODES)
     rate = seeds * config.num_rounds * config.steps_per_round / times.run
     share = 2 * rate / (before + physics.alone(env, config.num_envs))
     over_seeds = lambda name: np.array([np.mean(getattr(run.evaluation, name)) for run in runs])

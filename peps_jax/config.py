@@ -53,6 +53,22 @@ class Problem:
     belief: Any
 
 
+def capacity(number: int) -> int:
+    """Room for `number` of something: the next of 1, 2, 3, 4, 5, 6, 8, 10, 12, ...; what fits into one room shares a program."""
+    scale = 10 ** max(0, len(str(number)) - 2)
+    steps = (scale * size for size in (1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100))
+    return next(size for size in steps if size >= number)
+
+
+@struct.dataclass
+class Lengths:
+    """How long a training is, as values: a program has room for more."""
+
+    num_rounds: Any  # () int32
+    warmup_rounds: Any  # () int32, whose actions are all random
+    num_queries: Any  # () int32, asked in all
+
+
 @struct.dataclass
 class Config:
     """One training. Rewards and temperatures are in the environment's reward units; rates are per gradient step.
@@ -102,6 +118,14 @@ class Config:
     )
     exploration: Any = traced(0.1, SHARE, "share of the steps after that with such actions", group="run")
     hold_steps: int = static(5, COUNT, "steps for which such an action is held", group="run")
+    lengths: Any = traced(
+        None,
+        None,
+        "rounds and queries as values, where total_steps and num_queries say for how many there is room "
+        "(default: as many as there is room for)",
+        group="run",
+        flag=False,
+    )
 
     learning_rate: Any = traced(3e-3, POSITIVE, "Adam's rate for policy and critics", group="sac")
     fade_share: Any = traced(
@@ -232,8 +256,27 @@ class Config:
 
     @property
     def queries_per_round(self) -> int:
-        """Queries asked in each round until the budget is spent; there is room for one if nothing is asked."""
-        return max(1, -(-self.num_queries // self.num_rounds))
+        """Queries asked in each round until all are asked; there is room for one if nothing is asked."""
+        return capacity(max(1, -(-self.num_queries // self.num_rounds)))
+
+    @property
+    def room(self) -> int:
+        """Rounds that replay and preferences have room for."""
+        return capacity(self.num_rounds)
+
+    @property
+    def length_values(self) -> Lengths:
+        """`lengths`, or what the sizes say."""
+        return self.lengths or Lengths(self.num_rounds, self.warmup_rounds, self.num_queries)
+
+    def with_room(self) -> Config:
+        """The same training, equal in everything static to others of other lengths that fit into the same room."""
+        return self.replace(
+            total_steps=self.room * self.steps_per_round,
+            warmup_steps=0,
+            num_queries=self.room * self.queries_per_round,
+            lengths=jax.tree.map(np.int32, self.length_values),
+        )
 
     def check(self) -> None:
         """Raises ValueError, in one line, for the first field whose value makes no sense. Traced values are not looked at.

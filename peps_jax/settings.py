@@ -18,6 +18,7 @@ import peps_envs
 from peps_jax.config import Config, Problem
 
 _static = lambda **default: struct.field(pytree_node=False, **default)
+_whole = lambda: struct.field(metadata={"whole": True})
 
 
 @struct.dataclass
@@ -36,9 +37,10 @@ class ObjectiveSettings:
 class ScheduleSettings:
     """How a training is divided into rounds, and what changes from round to round."""
 
-    num_rounds: int = _static()
+    room: int = _static()  # rounds that replay has room for
     steps_per_round: int = _static()  # of all environments
-    warmup_rounds: int = _static()
+    num_rounds: Array = _whole()
+    warmup_rounds: Array = _whole()
     learning_rate: Array
     fade_share: Array
     initial_temperature: Array
@@ -126,18 +128,13 @@ class SurrogateSettings:
 class QuerySettings:
     """How queries are made and chosen."""
 
-    num_rounds: int = _static()
     per_round: int = _static()
-    budget: int = _static()  # in all; the last round may have fewer than others
+    room: int = _static()  # places that all rounds' queries take
+    budget: Array = _whole()  # in all; the last round may have fewer than others
     segment_length: int = _static()  # steps
     min_segment_length: int = _static()
     strategy: str = _static()
     candidates_per_query: int = _static()
-
-    @property
-    def room(self) -> int:
-        """Places that all rounds' queries take."""
-        return self.num_rounds * self.per_round
 
 
 @struct.dataclass
@@ -171,9 +168,10 @@ def settings_of(config: Config, problem: Problem) -> Settings:
     environment = problem.environment
     spaces = dict(observation_size=environment.observation_size, action_space=environment.action_space)
     models = dict(ensemble_size=config.ensemble_size, hidden_sizes=config.model_hidden_sizes)
+    lengths = config.length_values
     return Settings(
         objective=_record(ObjectiveSettings, config, entropy_offset=_entropy_offset(config, problem)),
-        schedule=_record(ScheduleSettings, config),
+        schedule=_record(ScheduleSettings, config, num_rounds=lengths.num_rounds, warmup_rounds=lengths.warmup_rounds),
         rollout=_record(RolloutSettings, config, length=config.rollout_length, imagines=False),
         agent=_record(AgentSettings, config, updates=config.updates_per_round, **spaces),
         dynamics=_record(
@@ -201,7 +199,8 @@ def settings_of(config: Config, problem: Problem) -> Settings:
             QuerySettings,
             config,
             per_round=config.queries_per_round,
-            budget=config.num_queries,
+            room=config.room * config.queries_per_round,
+            budget=lengths.num_queries,
             strategy=config.query_strategy,
         ),
         human=_record(HumanSettings, config),
@@ -209,14 +208,15 @@ def settings_of(config: Config, problem: Problem) -> Settings:
 
 
 def _record(kind: type, config: Config, **values: Any) -> Any:
-    """A record of `kind`: fields that are called as in `config` have its values. Traced ones are 32-bit floats.
+    """A record of `kind`: fields that are called as in `config` have its values. Traced ones are 32-bit floats, or whole numbers.
 
     The library's own numbers are 32-bit whatever JAX's default is: networks learn no better from more.
     """
     found = {}
     for name, field in kind.__dataclass_fields__.items():
         value = values[name] if name in values else getattr(config, name)
-        found[name] = jnp.asarray(value, jnp.float32) if field.metadata.get("pytree_node", True) else value
+        number = jnp.int32 if field.metadata.get("whole") else jnp.float32
+        found[name] = jnp.asarray(value, number) if field.metadata.get("pytree_node", True) else value
     return kind(**found)
 
 

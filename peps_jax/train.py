@@ -124,7 +124,7 @@ def init(training: Training, teacher: Teacher = SYNTHETIC) -> TrainingState:
     room = data.empty(settings.queries.room, settings.queries.segment_length, *spaces)
     return state.replace(
         preferences=data.before(teacher.recorded, room, teacher.asks),
-        budget=jnp.asarray(settings.queries.budget if teacher.asks else 0, jnp.int32),
+        budget=jnp.asarray(settings.queries.budget if teacher.asks else 0),
     )
 
 
@@ -133,7 +133,7 @@ def _untaught(training: Training) -> TrainingState:
     settings, method = training.settings, training.method
     key_agent, key_knowledge, key_actors, key = jax.random.split(generator.key(training.config.seed), 4)
     spaces = settings.agent.observation_size, settings.agent.action_space
-    capacity = settings.schedule.num_rounds * settings.schedule.steps_per_round
+    capacity = settings.schedule.room * settings.schedule.steps_per_round
     return TrainingState(
         agents=tuple(sac.init(key, settings.agent) for key in sac.agent_keys(key_agent, len(method.rewards))),
         knowledge=method.init(key_knowledge, settings),
@@ -249,11 +249,11 @@ def train(config: Config, teacher: Teacher = SYNTHETIC) -> Result:
     """
     check(config)
     training = prepare(config, teacher)
-    teacher.check(training.method.asks, training.settings)
+    teacher.check(training.method.asks, training.settings, config.num_rounds)
     state = init(training, teacher)
     if teacher.host is not None:
         return finish(*run_with_host(state, training, teacher.host), training)
-    indices = jnp.arange(training.settings.schedule.num_rounds, dtype=jnp.int32)
+    indices = jnp.arange(config.num_rounds, dtype=jnp.int32)
     return finish(*_run_rounds(state, indices, training), training)
 
 
@@ -278,7 +278,7 @@ def run_with_host(
         raise ValueError("teacher is outside the program: train can't be inside jax.jit, jax.vmap or a scan then")
     first_half, file, second_half = halves
     rows = []
-    for index in range(training.settings.schedule.num_rounds):
+    for index in range(training.config.num_rounds):
         now = round_at(jnp.asarray(index, jnp.int32), state.key, training.settings.schedule)
         state, queries, collected = first_half(state, now, training)
         said = None if queries is None else host(jax.device_get(queries), index)

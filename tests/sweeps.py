@@ -8,7 +8,7 @@ from pathlib import Path
 from commands import exit_code
 
 import peps_envs
-from peps_jax.execution import batches, compilation_cache
+from peps_jax.execution import compilation_cache
 from peps_jax.sweep import command, pictures
 
 SIZES = [
@@ -23,7 +23,6 @@ def with_line(patch, line) -> None:
     """The line as an environment that command lines know, in batches of two runs, and a moment's drawing."""
     task = peps_envs.Task(line.env, line.params, {"noisy": line.belief, "true": line.params})
     patch.setitem(peps_envs.registry._TASKS, "line", lambda: task)
-    patch.setattr(batches, "RUNS_PER_DEVICE", 1)
     patch.setattr(pictures, "draw", lambda rows, folder: [])
 
 

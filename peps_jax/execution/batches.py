@@ -15,8 +15,6 @@ from peps_jax.execution.devices import side_by_side
 from peps_jax.execution.program import FinishedRun, Progress, Times, memory_need, program, structure
 from peps_jax.preferences.data import PreferenceSet
 
-RUNS_PER_DEVICE = 5  # of a CPU in one batch at most, where it matters that a batch is soon done and kept
-
 
 class Batch(NamedTuple):
     """Runs that go together in one program."""
@@ -45,8 +43,11 @@ class Watch:
 
 
 def runs_soon_done(devices: Sequence[jax.Device]) -> int | None:
-    """`most` of `plan` for batches that are soon done and kept; None of devices that are quicker with many runs."""
-    return None if side_by_side(devices) else RUNS_PER_DEVICE * len(devices)
+    """`most` of `plan` for batches that are soon done and kept; None of devices that are quicker with many runs.
+
+    A CPU's devices work on their runs one after the other anyway. With one for each, any number of runs has the same program.
+    """
+    return None if side_by_side(devices) else len(devices)
 
 
 def plan(
@@ -58,7 +59,7 @@ def plan(
     shares: int = 1,
     recorded: PreferenceSet | None = None,
 ) -> list[Batch]:
-    """Divides runs into batches: one structure each, and split further where they would not fit in memory.
+    """Divides runs into batches: one structure and number of rounds each, and split further where they would not fit in memory.
 
     Args:
       devices: that share the runs; all by default.
@@ -73,7 +74,7 @@ def plan(
     devices = tuple(jax.devices() if devices is None else devices)
     groups: dict[Any, list[int]] = {}
     for place, config in enumerate(configs):
-        groups.setdefault(structure(config), []).append(place)
+        groups.setdefault((structure(config), config.num_rounds), []).append(place)
     batches = []
     for places in groups.values():
         used = devices[: -(-len(places) // shares)]
@@ -109,5 +110,5 @@ def run(
         compiled, compiling = program(configs[batch.runs[0]], batch.slots, num_episodes, batch.devices, recorded)
         start = watch.start(batch)
         report = functools.partial(watch.advanced, batch)
-        finished, running = compiled.run([configs[place] for place in batch.runs], report, start)
+        finished, running = compiled.run([configs[place] for place in batch.runs], num_episodes, report, start)
         watch.finished(batch, finished, compiling + running)

@@ -40,11 +40,16 @@ class IncompatibleError(ValueError):
 
 
 class Rhythm:
-    """When a checkpoint is due: every so many seconds, and more seldom where they take long."""
+    """When a checkpoint is due: every so many seconds, and more seldom where they take long.
 
-    def __init__(self, every: float):
-        self._every = every  # s; 0: at every opportunity
-        self._latest, self._cost = time.monotonic(), 0.0
+    Args:
+      every: s; 0: at every opportunity.
+      at_once: whether the first one is due immediately.
+    """
+
+    def __init__(self, every: float, at_once: bool = False):
+        self._every = every
+        self._latest, self._cost = float("-inf") if at_once else time.monotonic(), 0.0
 
     def due(self) -> bool:
         """Whether it is time for one."""

@@ -16,16 +16,19 @@ import numpy as np
 from flax import struct
 
 from peps_jax import generator, methods
-from peps_jax.config import Config
+from peps_jax.config import Config, capacity
 from peps_jax.evaluate import Evaluation, evaluate
 from peps_jax.execution import compilation_cache, devices, memory
 from peps_jax.preferences import teachers
 from peps_jax.preferences.data import PreferenceSet
-from peps_jax.train import Result, TrainingState, finish, init, prepare, run_round, run_rounds
+from peps_jax.train import Result, TrainingState, finish, init, prepare, run_round
 
 # What runs once isn't worth optimizing: it compiles in half the time, and takes a tenth of a second more.
 QUICKLY = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-REPORTS = 40  # chunks of rounds that a training is about cut into: progress, and a place to stop, between two of them
+REPORTS = (
+    40  # chunks of rounds that a training is at least cut into: progress, and a place to stop, between two of them
+)
+CHUNK = 32  # rounds in one at most
 
 
 @struct.dataclass
@@ -65,9 +68,12 @@ Report = Callable[
 
 
 def shared(config: Config) -> Config:
-    """`config` with its task's code and numbers in place of names, so that environments which share code share a program."""
+    """`config` with its task's code and numbers in place of names, and its lengths as values.
+
+    So environments which share code share a program, and trainings of other lengths as well.
+    """
     problem = config.problem()
-    return config.replace(env=problem.environment, params=problem.params, belief=problem.belief)
+    return config.with_room().replace(env=problem.environment, params=problem.params, belief=problem.belief)
 
 
 def structure(config: Config) -> Any:
@@ -100,9 +106,24 @@ def begin(config: Config, recorded: PreferenceSet | None = None) -> TrainingStat
     return init(prepare(config, teacher), teacher)
 
 
-def advance(state: TrainingState, indices: jax.Array, config: Config) -> Any:
-    """Rounds `indices`: state and curves. The same program whether or not anything was recorded before."""
-    return run_rounds(state, indices, prepare(config))
+def advance(state: TrainingState, span: jax.Array, config: Config) -> Any:
+    """Rounds span[0] to span[1], the last one excluded, of at most `CHUNK`: state, and curves (CHUNK,), 0 after their end.
+
+    The same program for any number of rounds, and whether or not anything was recorded before.
+    """
+    training = prepare(config)
+    one_round = jax.jit(lambda state, index: run_round(state, index, training))  # traced once
+    curves = jax.eval_shape(one_round, state, span[0])[1]
+    nothing = jax.tree.map(lambda value: jnp.zeros((CHUNK, *value.shape), value.dtype), curves)
+
+    def another(index: jax.Array, carry: Any) -> Any:
+        state, curves = carry
+        state, figures = one_round(state, index)
+        place = index - span[0]
+        write = lambda rows, row: jax.lax.dynamic_update_index_in_dim(rows, row, place, 0)
+        return state, jax.tree.map(write, curves, figures)
+
+    return jax.lax.fori_loop(span[0], span[1], another, (state, nothing))
 
 
 def score(state: TrainingState, config: Config, num_episodes: int) -> Evaluation:
@@ -136,7 +157,7 @@ def memory_need(config: Config, num_episodes: int, recorded: PreferenceSet | Non
     of 64 and 256), and up to 23 % more where a chunk is a single round. Most of it are the minibatches of a round,
     updates_per_round * batch_size transitions.
     """
-    shapes = _shapes_of(recorded)
+    shapes, num_episodes = _shapes_of(recorded), capacity(num_episodes)
     key = structure(config), num_episodes, tuple(shapes)
     if key not in _NEEDS:  # tracing takes seconds
         about = written(config, "memory", num_episodes, shapes)
@@ -168,16 +189,9 @@ def _memory_need(config: Config, num_episodes: int, recorded: PreferenceSet | No
 # --- programs -------------------------------------------------------------------------------------------------------------
 
 
-def chunk_lengths(num_rounds: int) -> list[int]:
-    """Rounds between two reports, summing to `num_rounds`; of at most two different lengths, since each is a program.
-
-    A length that divides `num_rounds` is taken unless it makes many more chunks than `REPORTS`.
-    """
-    longest = max(1, num_rounds // REPORTS)
-    divisor = next(length for length in range(longest, 0, -1) if num_rounds % length == 0)
-    length = divisor if 4 * divisor >= longest else longest
-    rest = num_rounds % length
-    return [length] * (num_rounds // length) + [rest] * (rest > 0)
+def chunk_length(num_rounds: int) -> int:
+    """Rounds between two reports of a training of `num_rounds`."""
+    return min(max(1, num_rounds // REPORTS), CHUNK)
 
 
 class Program:
@@ -186,6 +200,7 @@ class Program:
     Args:
       config: any with the structure.
       slots: runs that it has room for.
+      num_episodes: that it has room for in an evaluation.
       recorded: preferences that were given before, the same for every run.
     """
 
@@ -199,7 +214,6 @@ class Program:
     ):
         self._config, self._slots, self._num_episodes, self._recorded = config, slots, num_episodes, recorded
         self._devices, self._sharding = tuple(used), devices.sharding(used)
-        self._chunks = chunk_lengths(config.num_rounds)
         self._compiled: dict[str, Any] = {}
 
     def compile(self) -> float:
@@ -216,16 +230,12 @@ class Program:
         recorded = self._recorded
         state = self._shapes(jax.eval_shape(jax.vmap(begin, in_axes=(0, None)), leaves, recorded))
         over = lambda function, **which: devices.over_devices(function, self._devices, **which)
-        further = over(advance, whole=(1,), donate=(0,))
-        indices = lambda length: jax.ShapeDtypeStruct((length,), jnp.int32)
+        span = jax.ShapeDtypeStruct((2,), jnp.int32)
         evaluation = lambda state, config: score(state, config, self._num_episodes)
         return {
             "init": over(begin, whole=(1,)).lower(leaves, recorded),
+            "rounds": over(advance, whole=(1,), donate=(0,)).lower(state, span, leaves),
             "evaluate": over(evaluation).lower(state, leaves),
-            **{
-                f"{length} rounds": further.lower(state, indices(length), leaves)
-                for length in sorted(set(self._chunks))
-            },
         }
 
     @property
@@ -241,25 +251,31 @@ class Program:
         return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=self._sharding), tree)
 
     def run(
-        self, configs: Sequence[Config], report: Report = lambda *_: None, start: Progress | None = None
+        self,
+        configs: Sequence[Config],
+        num_episodes: int,
+        report: Report = lambda *_: None,
+        start: Progress | None = None,
     ) -> tuple[list[FinishedRun], Times]:
         """Trains and evaluates `configs`, at most `slots`, and tells `report` after every chunk of rounds.
 
         Args:
+          configs: of one number of rounds.
+          num_episodes: of the evaluation, at most as many as there is room for.
           start: how far the same runs were before; the numbers are those of a run without a break.
         """
-        number = len(configs)
+        number, (num_rounds,) = len(configs), {config.num_rounds for config in configs}
         leaves = jax.device_put(stack(devices.padded(configs, self._slots)), self._sharding)
         began = time.perf_counter()
         if start is None:
             state, done, chunks, earlier = self._compiled["init"](leaves, self._recorded), 0, [], 0.0
         else:
             state, done, chunks, earlier = self._resumed(start), start.rounds, [start.curves], start.seconds
-        for length in self._chunks[self.chunks_in(done) :]:
-            indices = jnp.arange(done, done + length, dtype=jnp.int32)
-            state, curves = self._compiled[f"{length} rounds"](state, indices, leaves)
-            chunks.append({name: values[:number] for name, values in jax.device_get(curves).items()})
-            done += length
+        while done < num_rounds:
+            end = min(done + chunk_length(num_rounds), num_rounds)
+            state, curves = self._compiled["rounds"](state, np.array([done, end], np.int32), leaves)
+            chunks.append({name: values[:number, : end - done] for name, values in jax.device_get(curves).items()})
+            done = end
 
             def snapshot(state: TrainingState = state, done: int = done) -> Progress:
                 seconds = earlier + time.perf_counter() - began
@@ -268,6 +284,7 @@ class Program:
             report(done, chunks[-1], snapshot)
         trained = time.perf_counter()
         evaluations = jax.device_get(self._compiled["evaluate"](state, leaves))
+        evaluations = jax.tree.map(lambda episodes: episodes[:, :num_episodes], evaluations)
         learned = jax.device_get((state.agents, state.knowledge, state.preferences))
         times = Times(run=earlier + trained - began, evaluate=time.perf_counter() - trained)
         rows = (*learned, _joined(chunks), evaluations)
@@ -284,13 +301,6 @@ class Program:
             evaluation=evaluation,
             failed=not _finite((agents, knowledge, evaluation)),
         )
-
-    def chunks_in(self, rounds: int) -> int:
-        """How many chunks `rounds` are. Raises ValueError if none ends there."""
-        ends = np.cumsum([0, *self._chunks])
-        if rounds not in ends:
-            raise ValueError(f"rounds {rounds} end no chunk: chunks end at {', '.join(map(str, ends))}")
-        return int(np.flatnonzero(ends == rounds)[0])
 
     def _resumed(self, start: Progress) -> TrainingState:
         """`start`'s state on the devices."""
@@ -340,6 +350,7 @@ def program(
     recorded: PreferenceSet | None = None,
 ) -> tuple[Program, Times]:
     """The compiled program for runs like that of `config`, and what it took: nothing if it was compiled before in this process."""
+    num_episodes = capacity(num_episodes)  # the first ones are what fewer are
     key = structure(config), slots, used, num_episodes, id(recorded)
     found = _PROGRAMS.pop(key, None)
     made = Program(config, slots, num_episodes, used, recorded) if found is None else found

@@ -140,7 +140,7 @@ def learn(configs: Sequence[Config], recorded: PreferenceSet, scenes: int) -> Ag
 
     for config in configs:
         check(config)
-        teachers.recorded(recorded).check(True, prepare(config).settings)
+        teachers.recorded(recorded).check(True, prepare(config).settings, config.num_rounds)
     program, runs = compile_over_devices(one, list(map(shared, configs)))
     return jax.tree.map(lambda rows: np.asarray(rows)[: len(configs)], program(runs))
 

@@ -32,8 +32,8 @@ class Teacher(NamedTuple):
     host: Callable[[Queries, int], Answers | None] | None = None
     asks: bool = True  # whether anything is asked in the training
 
-    def check(self, asks: bool, settings: Settings) -> None:
-        """Raises ValueError, in one line, if what was recorded doesn't fit a training with such settings.
+    def check(self, asks: bool, settings: Settings, num_rounds: int) -> None:
+        """Raises ValueError, in one line, if what was recorded doesn't fit a training of so many rounds with such settings.
 
         Args:
           asks: whether the training's method makes anything of preferences.
@@ -44,10 +44,10 @@ class Teacher(NamedTuple):
         if isinstance(self.recorded.since, jax.core.Tracer):
             return
         last = np.asarray(self.recorded.since).max()
-        if last >= settings.schedule.num_rounds:
+        if last >= num_rounds:
             raise ValueError(
-                f"preferences were given until round {last}, and this training has {settings.schedule.num_rounds} "
-                "rounds: raise total_steps, or take all from the start with preferences.data.at_once"
+                f"preferences were given until round {last}, and this training has {num_rounds} rounds: raise "
+                "total_steps, or take all from the start with preferences.data.at_once"
             )
 
 

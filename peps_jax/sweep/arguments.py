@@ -236,7 +236,7 @@ def _recorded(file: str, configs: Sequence[Config]) -> PreferenceSet:
         names = ", ".join(name for name, method in methods.METHODS.items() if method.asks)
         raise ValueError(f"preferences {file!r} would teach nothing: of the methods only {names} learn from any")
     for config in {(config.env, config.method): config for config in asking}.values():
-        teachers.recorded(preferences).check(True, prepare(config).settings)
+        teachers.recorded(preferences).check(True, prepare(config).settings, config.num_rounds)
     return preferences
 
 

@@ -70,7 +70,7 @@ class Training:
         """Trains this process's share; the process that leads makes the tables of all."""
         sweep = self._sweep
         with workers.Life(self._wanted.out, self._team) as life:
-            sweep.run(stop)
+            sweep.run(stop, lambda rows: _drawn(rows, self._wanted.out))
             if not self._team.leads:
                 return _share_done(self._wanted, self._team, life.others.ends().get(0))
             wrong = sweep.gather(stop, life.others)
@@ -177,11 +177,15 @@ def _clear_up(folder: Path) -> None:
 
 
 def _draw(rows: Sequence[Row], folder: Path) -> list[str]:
-    from peps_jax.sweep import pictures  # matplotlib takes its time
-
     print("drawing", file=sys.stderr)
     with Reminder("drawing"):
-        return [path.name for path in pictures.draw(rows, folder)]
+        return [path.name for path in _drawn(rows, folder)]
+
+
+def _drawn(rows: Sequence[Row], folder: Path) -> list[Path]:
+    from peps_jax.sweep import pictures  # matplotlib takes its time
+
+    return pictures.draw(rows, folder)
 
 
 if __name__ == "__main__":

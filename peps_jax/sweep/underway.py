@@ -24,6 +24,8 @@ from peps_jax.sweep import journal, results, workers
 from peps_jax.sweep.arguments import Request
 from peps_jax.sweep.results import Row
 
+SHOWN_EVERY = 60.0  # s between two pictures of what is finished so far; the first is made as soon as there is something
+
 
 class Sweep:
     """A request on its way: what is finished, and its folder, which is this sweep's from `begin` to `close`.
@@ -197,15 +199,18 @@ class Sweep:
 
     # what runs
 
-    def run(self, stop: threading.Event) -> None:
+    def run(self, stop: threading.Event, show: Callable[[Sequence[Row]], None] = lambda rows: None) -> None:
         """Runs this process's batches, and takes in the others'.
+
+        Args:
+          show: called with what is finished, now and then.
 
         Raises:
           StoppedError: `stop` was set, and a checkpoint is made.
           IncompatibleError: a checkpoint that doesn't fit.
         """
         checkpoints.prepare()
-        with Keeper(self, stop) as keeper:
+        with Keeper(self, stop, show) as keeper:
             batches.run(self._configs, list(self.batches.values()), self._wanted.episodes, keeper, self.recorded)
 
     def gather(self, stop: threading.Event, others: workers.Others) -> dict[int, str]:
@@ -243,11 +248,12 @@ class Sweep:
 
 
 class Keeper(Display):
-    """Progress on stderr; checkpoints, and every batch kept as soon as it is done."""
+    """Progress on stderr; checkpoints, and every batch kept as soon as it is done, and shown now and then."""
 
-    def __init__(self, sweep: Sweep, stop: threading.Event):
+    def __init__(self, sweep: Sweep, stop: threading.Event, show: Callable[[Sequence[Row]], None]):
         super().__init__(sweep._configs, list(sweep.batches.values()), name=sweep._team.name)
-        self._sweep, self._stop = sweep, stop
+        self._sweep, self._stop, self._show = sweep, stop, show
+        self._shows = checkpoints.Rhythm(SHOWN_EVERY, at_once=True)
         self._number_of = {one: number for number, one in sweep.batches.items()}
         self._rhythm = checkpoints.Rhythm(sweep._wanted.running["checkpoint_every"])
 
@@ -278,6 +284,11 @@ class Keeper(Display):
 
     def finished(self, current: batches.Batch, runs: Sequence[FinishedRun], times: Times) -> None:
         self._sweep.keep(self._number_of[current], runs, times)
+        if self._sweep._team.leads and not self._sweep.complete and self._shows.due():
+            rows, out = self._sweep.rows(), self._sweep._wanted.out
+            self.say(f"drawing {len(rows)} of {len(self._sweep._wanted.keys)} rows, in {out}")
+            with self._shows.making():
+                self._show(rows)
 
 
 def _about(wanted: Request) -> dict[str, str]:

@@ -12,7 +12,7 @@ from conftest import Line, LineParams
 
 import peps_envs
 from peps_jax import methods
-from peps_jax.execution import compilation_cache, program
+from peps_jax.execution import batches, compilation_cache, program
 from peps_jax.storage import files
 
 EPISODES = 2
@@ -154,7 +154,7 @@ configs = [Config(method="sac", seed=seed, **sizes) for seed in range(2)]
 if sys.argv[1] == "known":
     program.Program._lowered = None
 compiled, _ = program.program(configs[0], planned.slots, 2, planned.devices)
-finished, _ = compiled.run(configs)
+finished, _ = compiled.run(configs, 2)
 print([one.evaluation.return_.tolist() for one in finished], compiled.bytes_used)
 """
 
@@ -164,6 +164,32 @@ def test_another_process_finds_a_trainings_programs(place):
         subprocess.run([sys.executable, "-c", PROGRAM, word], capture_output=True, encoding="utf-8", check=True).stdout
     )
     assert run("new") == run("known")
+
+
+@pytest.mark.slow
+def test_other_lengths_episodes_and_numbers_of_runs_compile_nothing(line, train, monkeypatch):
+    """What has room in a program uses it, and has the numbers of a training by itself."""
+    compiled = []
+    compile_ = program.Program.compile
+    monkeypatch.setattr(program.Program, "compile", lambda self: compiled.append(self) or compile_(self))
+    monkeypatch.setattr(program, "_PROGRAMS", {})
+    base = line.replace(method="peps", total_steps=8 * line.steps_per_round, num_queries=16)
+    shorter = base.replace(total_steps=7 * line.steps_per_round, warmup_steps=0, num_queries=13)
+    few, many = [base], [shorter.replace(seed=seed) for seed in range(3)]
+    assert few[0].num_rounds != many[0].num_rounds
+    finished = []
+    for configs, episodes in ((few * 2, 8), (many, 7)):
+        watch = batches.Watch()
+        watch.finished = lambda batch, runs, times: finished.extend(runs)
+        planned = batches.plan(configs, episodes, most=batches.runs_soon_done(jax.devices()))
+        batches.run(configs, planned, episodes, watch)
+    assert len(compiled) == 1
+    assert [run.evaluation.return_.shape for run in finished] == [(8,)] * 2 + [(7,)] * 3
+    assert finished[-1].curves["return_"].shape == (many[0].num_rounds,)
+    assert np.sum(finished[-1].preferences.weight > 0) == 13
+    alone = train(many[2])
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
+    jax.tree.map(close, (finished[-1].curves, finished[-1].agents), (alone.curves, alone.agents))
 
 
 def test_a_process_holds_few_programs_at_once(line, monkeypatch):

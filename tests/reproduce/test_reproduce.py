@@ -327,7 +327,6 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
 @pytest.mark.slow
 def test_a_stopped_table_continues(tmp_path, capsys, tiny, monkeypatch):
     monkeypatch.setattr(plan, "PLANNER", {name: dict(points=1, resolution=13) for name in plan.PLANNER})
-    monkeypatch.setattr(batches, "RUNS_PER_DEVICE", 1)  # two batches
     monkeypatch.setattr(table1, "ROWS", {name: (name, {}) for name in ("peps", "sac")})
     monkeypatch.setattr(table1, "BASELINES", ("sac",))
     for module in (table1, figure1):

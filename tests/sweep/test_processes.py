@@ -36,7 +36,6 @@ def team(line, monkeypatch):
     """Threads in place of processes: whoever says which one it is has joined the others already."""
     task = peps_envs.Task(line.env, line.params, {"noisy": line.belief, "true": line.params})
     monkeypatch.setitem(peps_envs.registry._TASKS, "line", lambda: task)
-    monkeypatch.setattr(batches, "RUNS_PER_DEVICE", 1)
     monkeypatch.setattr(pictures, "draw", lambda rows, folder: [])
     monkeypatch.setattr(workers, "SILENCE", 1.0)
     monkeypatch.setattr(workers, "BEAT", 0.1)
