@@ -288,6 +288,7 @@ class Config:
             if field.metadata.get("pytree_node", True):
                 check_single(field, getattr(self, field.name))
         _check_problem(self.problem())
+        _check_lengths(self)
         if self.num_envs % self.watched_every:
             raise ValueError(
                 f"watched_every {self.watched_every} doesn't divide the environments: "
@@ -319,6 +320,17 @@ def _check_problem(problem: Problem) -> None:
                 f"belief has {jax.tree_util.keystr(path)} of shape {np.shape(other)} and params of {np.shape(one)}: "
                 "give both the same shapes, and one training one value"
             )
+
+
+def _check_lengths(config: Config) -> None:
+    """Raises ValueError if there is no room for so many rounds or queries. Traced values are not looked at."""
+    room = {"num_rounds": config.num_rounds, "num_queries": config.num_rounds * config.queries_per_round}
+    for name, most in room.items():
+        value = getattr(config.length_values, name)
+        if not isinstance(value, jax.core.Tracer) and not np.all(
+            (np.asarray(value) >= 0) & (np.asarray(value) <= most)
+        ):
+            raise ValueError(f"lengths have {name} {shown(value)}: there is room for {most}; choose at most that")
 
 
 def _kind(tree: Any) -> str:

@@ -10,6 +10,7 @@ from conftest import Line, LineParams, settings
 
 import peps_jax
 from peps_jax import Config, grid
+from peps_jax.config import Lengths, capacity
 from peps_jax.train import check
 
 WRONG = [
@@ -122,7 +123,7 @@ def test_belief_by_name_and_by_value(tiny):
 
 
 def test_every_field_has_a_check_and_a_help_text():
-    named = {"env", "method", "params", "belief"}  # looked up, or compared with one another
+    named = {"env", "method", "params", "belief", "lengths"}  # looked up, or compared with one another
     for field in dataclasses.fields(Config):
         assert field.metadata["help"], field.name
         assert field.metadata["group"], field.name
@@ -137,7 +138,7 @@ def test_every_field_reaches_a_part(tiny):
         and all(np.array_equal(*pair) for pair in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True))
     )
     for field in dataclasses.fields(Config):
-        if field.name in ("env", "method", "seed", "params", "belief"):
+        if field.name in ("env", "method", "seed", "params", "belief", "lengths"):
             continue
         value = getattr(tiny, field.name)
         others = {
@@ -189,3 +190,21 @@ def test_grid_says_what_is_wrong(line, leaves, message):
     with pytest.raises(ValueError, match=message) as error:
         grid(line, **leaves)
     one_line(error)
+
+
+def test_lengths_have_to_fit_in():
+    config = Config(total_steps=4_000, num_queries=20).with_room()
+    config.check()
+    assert (config.total_steps, config.num_queries) == (4_000, 20)
+    assert jax.tree.map(int, config.lengths) == Lengths(num_rounds=10, warmup_rounds=12, num_queries=20)
+    with pytest.raises(ValueError, match="lengths have num_rounds 11: there is room for 10; choose at most that"):
+        config.replace(lengths=config.lengths.replace(num_rounds=11)).check()
+    with pytest.raises(ValueError, match="lengths have num_queries 21: there is room for 20"):
+        config.replace(lengths=config.lengths.replace(num_queries=21)).check()
+
+
+def test_room_is_a_round_number():
+    assert [capacity(number) for number in (1, 5, 6, 7, 11, 50, 51, 99, 150, 151, 1_234, 10_001)] == [
+        1, 5, 6, 8, 12, 50, 60, 100, 150, 200, 1_500, 12_000,
+    ]  # fmt: skip
+    assert all(capacity(capacity(number)) == capacity(number) >= number for number in range(1, 3_000))
