@@ -85,7 +85,7 @@ def test_a_round_has_the_same_types_in_either_precision(env):
 def test_every_setting_keeps_its_types_in_double_precision(method, changes):
     with jax.enable_x64(True):
         config = config_of("line", method).replace(**changes)
-        assert kinds(jax.eval_shape(lambda config: prepare(config).settings, config)) == {"float32"}
+        assert kinds(jax.eval_shape(lambda config: prepare(config).settings, config)) == {"float32", "int32"}
         result = jax.eval_shape(peps_jax.train, config)
         assert kinds((result.agents, result.knowledge, result.preferences)) <= {"float32", "int32", "uint32", "bool"}
         assert kinds(result.curves) == {"float32"}

@@ -289,6 +289,7 @@ class Keeper(Display):
             self.say(f"drawing {len(rows)} of {len(self._sweep._wanted.keys)} rows, in {out}")
             with self._shows.making():
                 self._show(rows)
+            self._sweep.owner.check()  # that took a while
 
 
 def _about(wanted: Request) -> dict[str, str]:

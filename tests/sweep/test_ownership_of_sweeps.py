@@ -46,7 +46,8 @@ MOMENTS = {
     "as it makes a checkpoint": (files, "write_folder", 2),
     "as it keeps a batch": (journal.Journal, "commit", 1),
     "as it begins another batch": (underway.Keeper, "start", 2),
-    "as it draws": (pictures, "draw", 1),
+    "as it draws what is finished": (pictures, "draw", 1),
+    "as it draws all": (pictures, "draw", 2),
     "as it closes": (underway.Sweep, "close", 1),
     "as it removes its progress": (journal, "close", 1),
 }

@@ -112,7 +112,7 @@ def test_every_field_is_a_flag(capsys):
     assert call(["--help"]) == 0
     text = capsys.readouterr().out.replace(",", " ")
     for name in peps_jax.Config.__dataclass_fields__:
-        assert (f"--{name.replace('_', '-')} " in text) == (name != "params"), name
+        assert (f"--{name.replace('_', '-')} " in text) == (name not in ("params", "lengths")), name
 
 
 def test_one_device_per_core_unless_told_otherwise(monkeypatch):
@@ -300,7 +300,8 @@ def test_an_interrupted_sweep_keeps_what_is_finished(line, line_task, tmp_path, 
     assert json.loads((tmp_path / results.MANIFEST).read_text(encoding="utf-8"))["status"] == "interrupted"
     assert peps_jax.load(tmp_path, 1).act(jnp.zeros(1)).shape == (1,)
     assert (tmp_path / "notes.txt").read_text(encoding="utf-8") == "mine"
-    assert not (tmp_path / results.PICTURES[0]).exists()
+    drawn = (tmp_path / results.PICTURES[0]).read_bytes()
+    assert drawn.startswith(b"\x89PNG"), "of what is finished, not an earlier run's"
 
 
 @pytest.mark.slow
