@@ -43,7 +43,7 @@ def seeds(config: Config, most: int, repeats: int) -> dict[str, float]:
             programs[filled], _ = timing.compiled(train, batched)
         calls = range(-(-size // inside))
         in_batches = lambda runs, program=programs[filled], calls=calls: [program(runs) for _ in calls]
-        taken[str(size)] = timing.seconds(in_batches, batched, repeats=repeats)
+        taken[str(size)] = timing.seconds(in_batches, batched, repeats=repeats if size <= MOST else 1)
         size *= 2
     return taken
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -52,7 +53,8 @@ class Display(batches.Watch):
         shown = lambda: Group(self._bar, Text(self._figures))
         self._live = Live(get_renderable=shown, console=console) if console.is_terminal and not name else None
         self._before, self._started = 0, 0.0  # steps and clock at the batch's start
-        self._printed = 0.0  # clock at the last line
+        self._printed = float("-inf")  # clock at the last line
+        self._said: set[str] = set()
         self._reminder = Reminder("beginning", self._remind)
         self._latest = {"return_": float("nan"), "explicability": float("nan")}
 
@@ -72,8 +74,11 @@ class Display(batches.Watch):
         self._doing = text
         self._bar.update(self._task, description=text)
         self._reminder.about(text)
-        if not self._live:
+        news = re.sub(r", batch \d+/\d+", "", text)  # many batches are soon done, and alike
+        if not self._live and news not in self._said:
             print_line(f"{self._name}{text}")
+            self._said.add(news)
+            self._printed = time.perf_counter()
 
     def _remind(self, text: str) -> None:
         if self._live:
@@ -92,7 +97,6 @@ class Display(batches.Watch):
         self.say(f"training {self._described(batch)}" + f", from round {rounds} on" * (rounds > 0))
         self._done += rounds * self._steps_per_round(batch)
         self._before, self._started = self._done, time.perf_counter()
-        self._printed = self._started
 
     def finished(self, batch: batches.Batch, runs: Sequence[FinishedRun], times: Times) -> None:
         self._keep(batch, runs, times)
