@@ -25,9 +25,8 @@ from peps_jax.train import Result, TrainingState, finish, init, prepare, run_rou
 
 # What runs once isn't worth optimizing: it compiles in half the time, and takes a tenth of a second more.
 QUICKLY = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-REPORTS = (
-    40  # chunks of rounds that a training is at least cut into: progress, and a place to stop, between two of them
-)
+# A training is cut into chunks of rounds: progress, and a place to stop, between two of them.
+REPORTS = 40  # at least
 CHUNK = 32  # rounds in one at most
 
 
