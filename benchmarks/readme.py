@@ -87,7 +87,8 @@ def settings(_: str | None) -> str:
         row = (f"`{field.name}`", default, kind, field.metadata["help"].replace("|", "\\|"))
         groups.setdefault(field.metadata["group"], []).append(row)
     head = ("field", "default", "kind", "what it is")
-    return "\n\n".join(f"### {name.capitalize()}\n\n{markdown(head, rows).strip()}" for name, rows in groups.items())
+    title = lambda name: name.upper() if name == "sac" else name.capitalize()
+    return "\n\n".join(f"### {title(name)}\n\n{markdown(head, rows).strip()}" for name, rows in groups.items())
 
 
 GENERATED: dict[str, Callable[[str | None], str]] = {"headline": headline, "settings": settings}
