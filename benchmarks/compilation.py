@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 
 from peps_jax import Config
-from peps_jax.execution.program import advance, begin, score, shared
+from peps_jax.execution.program import advance, begin, roomy, score
 from peps_jax.storage.tables import markdown
 
 OUT = pathlib.Path(__file__).parent / "results" / "compilation.md"
@@ -35,12 +35,12 @@ SHOWN = 30  # functions
 
 def programs(env: str, method: str) -> dict[str, tuple[Any, tuple[Any, ...]]]:
     """Functions and arguments: how a training begins, goes on for some rounds, and is evaluated."""
-    config = shared(Config(env=env, method=method, total_steps=STEPS))
+    config = roomy(Config(env=env, method=method, total_steps=STEPS))
     state = jax.eval_shape(begin, config)
     evaluation = lambda state, config: score(state, config, EPISODES)
     return {
         "begin": (begin, (config,)),
-        "rounds": (advance, (state, jnp.arange(ROUNDS), config)),
+        "rounds": (advance, (state, jnp.array([0, ROUNDS]), config)),
         "evaluate": (evaluation, (state, config)),
     }
 

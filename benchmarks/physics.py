@@ -45,7 +45,7 @@ def training(config: Config) -> tuple[float, float]:
     warm = configs[0].warmup_rounds
     batch = timing.spread(stack(configs))
     states, _ = timing.compiled(begin, batch)
-    go_on = lambda state, config: advance(state, warm + jnp.arange(ROUNDS), config)[0]
+    go_on = lambda state, config: advance(state, jnp.array([warm, warm + ROUNDS]), config)[0]
     state = states(batch)
     program, compilation = timing.compiled(go_on, state, batch)
     steps = jax.device_count() * ROUNDS * configs[0].steps_per_round

@@ -67,23 +67,28 @@ Report = Callable[
 
 
 def shared(config: Config) -> Config:
-    """`config` with its task's code and numbers in place of names, and its lengths as values.
-
-    So environments which share code share a program, and trainings of other lengths as well.
-    """
+    """`config` with its task's code and numbers in place of names, so that environments which share code share a program."""
     problem = config.problem()
-    return config.with_room().replace(env=problem.environment, params=problem.params, belief=problem.belief)
+    return config.replace(env=problem.environment, params=problem.params, belief=problem.belief)
+
+
+def roomy(config: Config) -> Config:
+    """`shared`, with lengths as values beside the room that there is, so that trainings of other lengths share a program too.
+
+    `train` of it would fill that room: it is for `begin`, `advance` and `score`.
+    """
+    return shared(config.with_room())
 
 
 def structure(config: Config) -> Any:
     """What decides which program a run needs: equal for runs that differ only in the values of traced leaves."""
-    leaves, tree = jax.tree.flatten(shared(config))
+    leaves, tree = jax.tree.flatten(roomy(config))
     return tree, tuple(jnp.shape(leaf) for leaf in leaves)
 
 
 def written(config: Config, *more: Any) -> str | None:
     """`structure` as text, for another process to recognise; None if code decides it that isn't this project's."""
-    one = shared(config)
+    one = roomy(config)
     ours = [type(one.env), *(part for part in methods.get(one.method) if callable(part))]
     if any(part.__module__.split(".")[0] not in ("peps_jax", "peps_envs") for part in ours):
         return None
@@ -96,7 +101,7 @@ def written(config: Config, *more: Any) -> str | None:
 
 def stack(configs: Sequence[Config]) -> Config:
     """One `Config` whose every leaf has a leading axis of runs."""
-    return devices.stack([shared(config) for config in configs])
+    return devices.stack([roomy(config) for config in configs])
 
 
 def begin(config: Config, recorded: PreferenceSet | None = None) -> TrainingState:
@@ -132,7 +137,7 @@ def score(state: TrainingState, config: Config, num_episodes: int) -> Evaluation
 
 def empty_progress(config: Config, runs: int, recorded: PreferenceSet | None = None) -> TrainingState:
     """Shapes and types of the state of a `Progress` of `runs` runs like that of `config`."""
-    shapes = jax.eval_shape(lambda config: _key_data(begin(config, recorded)), shared(config))
+    shapes = jax.eval_shape(lambda config: _key_data(begin(config, recorded)), roomy(config))
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((runs, *leaf.shape), leaf.dtype), shapes)
 
 
@@ -143,7 +148,7 @@ def empty_finished(config: Config, num_episodes: int) -> tuple[TrainingState, Ev
         state = begin(config)
         return state, score(state, config, num_episodes)
 
-    return jax.eval_shape(finished, shared(config))
+    return jax.eval_shape(finished, roomy(config))
 
 
 def memory_need(config: Config, num_episodes: int, recorded: PreferenceSet | None = None) -> memory.Need:
@@ -169,7 +174,7 @@ _NEEDS: dict[Any, memory.Need] = {}  # predicted in this process
 
 
 def _memory_need(config: Config, num_episodes: int, recorded: PreferenceSet | None) -> memory.Need:
-    one, indices = shared(config), jnp.zeros(1, jnp.int32)
+    one, indices = roomy(config), jnp.zeros(1, jnp.int32)
     one_round = lambda state, config: run_round(state, indices[0], prepare(config))
     try:
         state = jax.eval_shape(lambda config: begin(config, recorded), one)
@@ -304,7 +309,7 @@ class Program:
     def _resumed(self, start: Progress) -> TrainingState:
         """`start`'s state on the devices."""
         places = np.asarray(devices.padded(range(len(jax.tree.leaves(start.state)[0])), self._slots))
-        shapes = jax.eval_shape(lambda config: begin(config, self._recorded), shared(self._config))
+        shapes = jax.eval_shape(lambda config: begin(config, self._recorded), roomy(self._config))
         keys = lambda leaf, shape: generator.wrap(leaf) if _is_key(shape) else leaf
         state = jax.tree.map(keys, jax.tree.map(lambda leaf: leaf[places], start.state), shapes)
         return jax.device_put(state, self._sharding)

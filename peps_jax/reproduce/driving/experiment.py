@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from peps_jax import generator
+from peps_jax import generator, methods
 from peps_jax.config import Config
 from peps_jax.execution.devices import compile_over_devices
 from peps_jax.execution.program import shared
@@ -63,7 +63,9 @@ class Seen(NamedTuple):
 def learn(config: Config, each: Array | int, episodes: int) -> Seen:
     """One agent, taught by a group of its own with `each` answers of everybody, in the rain."""
     key_group, key_watch = jax.random.split(jax.random.fold_in(generator.key(config.seed), 1))
-    result = train(config, teachers.recorded(data.recording(*compare(key_group, each))))
+    asks = methods.get(config.method).asks  # what nobody hears needn't be traced
+    teacher = teachers.recorded(data.recording(*compare(key_group, each))) if asks else teachers.SYNTHETIC
+    result = train(config, teacher)
     scenes = watch_agent(result, key_watch, episodes)
     problem = result.training.problem
     reward = jax.vmap(jax.vmap(problem.environment.reward, (0, 0, 0, None)), (0, 0, 0, None))
