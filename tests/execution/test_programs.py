@@ -192,6 +192,13 @@ def test_other_lengths_episodes_and_numbers_of_runs_compile_nothing(line, train,
     jax.tree.map(close, (finished[-1].curves, finished[-1].agents), (alone.curves, alone.agents))
 
 
+def test_what_is_trained_as_a_whole_has_no_spare_rounds(tiny):
+    """`train` fills the room that its settings name; a program that is advanced by rounds may have more."""
+    config = tiny.replace(total_steps=7 * tiny.steps_per_round)
+    assert (program.shared(config).num_rounds, program.roomy(config).num_rounds) == (7, 8)
+    assert program.roomy(config).lengths.num_rounds == 7
+
+
 def test_a_process_holds_few_programs_at_once(line, monkeypatch):
     monkeypatch.setattr(program.Program, "compile", lambda self: 1.0)
     monkeypatch.setattr(program, "_PROGRAMS", {})

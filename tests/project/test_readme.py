@@ -230,7 +230,7 @@ def test_no_figure_is_typed_by_hand():
     assert set(module.PAGES) >= set(EXECUTED)
     for page in module.PAGES:
         assert module.embedded(text_of(page), page) == text_of(page), "run `make readme`"
-    assert "| D1 | 10 / 10 /" in module.embedded(
+    assert "| D1 | 20 / 20 /" in module.embedded(
         "<!-- begin headline benchmarks/results/table1.csv -->\n<!-- end -->", README
     )
 
