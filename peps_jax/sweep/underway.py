@@ -199,7 +199,7 @@ class Sweep:
 
     # what runs
 
-    def run(self, stop: threading.Event, show: Callable[[Sequence[Row]], None] = lambda rows: None) -> None:
+    def run(self, stop: threading.Event, show: Callable[[Sequence[Row]], None]) -> None:
         """Runs this process's batches, and takes in the others'.
 
         Args:
