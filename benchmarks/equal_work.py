@@ -10,4 +10,5 @@ def measured(method: str = "peps", width: int = 64) -> Config:
     return Config(
         env="nav-d1", method=method, hidden_sizes=(width, width), total_steps=40_000, num_queries=3_000,
         warmup_steps=3_200, updates_per_step=0.25, batch_size=256, learning_rate=1e-3, exploration=0.2, critic_normalisation=False,
+        surrogate_updates=20, surrogate_batch_size=32,
     )  # fmt: skip

@@ -25,6 +25,7 @@ class Case(NamedTuple):
     rows: int
     sizes: tuple[int, ...]
     normalised: bool = False
+    own_rows: bool = False  # whether every member has rows of its own
 
 
 WAYS: dict[str, Network] = {
@@ -41,7 +42,7 @@ def cases() -> dict[str, Case]:
     inputs = networks.feature_size(environment.observation_size, environment.action_space)
     compared = config.surrogate_batch_size * 2 * config.segment_length
     return {
-        "r̂": Case(config.ensemble_size, compared, (inputs, *config.model_hidden_sizes, 1)),
+        "r̂": Case(config.ensemble_size, compared, (inputs, *config.model_hidden_sizes, 1), own_rows=True),
         "critics of 64 units": Case(2, config.batch_size, (inputs, 64, 64, 1), config.critic_normalisation),
         "critics of 256 units": Case(2, config.batch_size, (inputs, 256, 256, 1), config.critic_normalisation),
     }
@@ -63,14 +64,15 @@ def seconds_of(way: Network, case: Case, steps: int) -> float:
 
     def loss(layers: tuple[networks.Layer, ...], rows: jax.Array) -> jax.Array:
         network = functools.partial(way, case.normalised)
-        return 0.5 * jnp.mean(jax.vmap(network, in_axes=(0, None))(layers, rows) ** 2)
+        return 0.5 * jnp.mean(jax.vmap(network, in_axes=(0, 0 if case.own_rows else None))(layers, rows) ** 2)
 
     def descend(layers: tuple[networks.Layer, ...], rows: jax.Array) -> tuple[networks.Layer, ...]:
         step = lambda weights, gradient: weights - 1e-3 * gradient
         one = lambda _, layers: jax.tree.map(step, layers, jax.grad(loss)(layers, rows))
         return jax.lax.fori_loop(0, steps, one, layers)
 
-    spread = timing.spread((layers, draw(case.rows, case.sizes[0])))
+    each = (case.members,) if case.own_rows else ()
+    spread = timing.spread((layers, draw(*each, case.rows, case.sizes[0])))
     program, _ = timing.compiled(descend, *spread)
     return timing.seconds(program, *spread, repeats=5) / steps
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pathlib
 from typing import Any
 
-from rounds import AT_ONCE, PARTS
+from rounds import BY_MINIBATCH, PARTS
 
 from peps_jax.drawing.panels import COLOURS, QUIET
 from peps_jax.storage.tables import markdown
@@ -147,7 +147,7 @@ def _equal_work(training: Record) -> str:
         "2 trainings on each core. A peer has all cores, as one process or as a training on each, whichever is faster "
         f"(at 64: {', '.join(ways)}). Stable-Baselines3 and SBX step D1 in one NumPy array for all 16, Brax "
         "and rejax step the JAX environment; evaluations are left out. DRLHP: in 400 steps 30 answers, and "
-        "40 gradient steps on 64 of them by each of five networks; imitation's teacher answers by r_A, which takes it less."
+        "20 gradient steps on 32 of them by each of five networks; imitation's teacher answers by r_A, which takes it less."
     )
 
 
@@ -169,10 +169,10 @@ def _rounds(rounds: Record) -> list[str]:
             f"A round of {method.upper()} at {width} takes {1000 * whole:.0f} ms: {shares}. Parts were timed as programs of "
             f"their own; together they are {sum(parts.values()) / whole:.0%} of the whole."
         )
-        if AT_ONCE in seconds:
+        if BY_MINIBATCH in seconds:
             lines.append(
-                f"Tried: {PARTS['value']} {VALUED_TOGETHER} minibatches at a time (taken), which fit in the cache; all of a "
-                f"round's at once took {seconds[AT_ONCE] / seconds['value']:.1f} times as long."
+                f"Tried: {PARTS['value']} of what is drawn from replay, {VALUED_TOGETHER} minibatches at a time, took "
+                f"{seconds[BY_MINIBATCH] / seconds['value']:.1f} times as long as of all that is there (taken)."
             )
     return lines
 

@@ -20,7 +20,7 @@ from peps_jax.preferences import data
 from peps_jax.preferences.data import PreferenceSet
 from peps_jax.round import round_at
 from peps_jax.train import TrainingState
-from peps_jax.trajectory import Trajectory, Transition
+from peps_jax.trajectory import Trajectory
 
 train = importlib.import_module("peps_jax.train")  # the module: the package shows the function of that name
 
@@ -29,10 +29,12 @@ PARTS = {  # as the text calls them
     "ask": "choosing and answering queries",
     "fit_dynamics": "fitting T_A",
     "fit_surrogate": "fitting r̂",
-    "value": "r̂ and entropies of the minibatches",
+    "value": "r̂ and entropies",
     "improve": "SAC's updates",
 }
-AT_ONCE = "value at once"  # tried: r-hat and entropies of all of a round's minibatches in one piece
+BY_MINIBATCH = (
+    "value by minibatch"  # tried: r-hat and entropies of what is drawn from replay instead of all that is there
+)
 
 
 class Prepared(NamedTuple):
@@ -41,7 +43,6 @@ class Prepared(NamedTuple):
     state: TrainingState
     trajectory: Trajectory
     preferences: PreferenceSet | None  # that are known
-    batches: Transition
 
 
 def prepare(config: Config) -> Prepared:
@@ -52,14 +53,11 @@ def prepare(config: Config) -> Prepared:
     act = lambda observation, key, time: team.act(state.agents, observation, key, settings.agent)[0]
     _, trajectory, _ = rollout.collect(state.actors, act, key, training.problem, settings.rollout)
     preferences = None if state.preferences is None else data.known(state.preferences, index)
-    batches = replay.sample(
-        state.replay, key, (settings.agent.updates, settings.agent.batch_size), index * config.steps_per_round
-    )
-    return Prepared(state, trajectory, preferences, batches)
+    return Prepared(state, trajectory, preferences)
 
 
 def parts(structure: Config) -> dict[str, Callable[[Prepared, Config], Any]]:
-    """What a round of PEPS does, by the names of `PARTS`; of SAC, what it does of that; `AT_ONCE`; and the `whole`."""
+    """What a round of PEPS does, by the names of `PARTS`; of SAC, what it does of that; `BY_MINIBATCH`; and the `whole`."""
     index, key = jnp.int32(structure.num_rounds // 2), jax.random.key(1)
     plain = lambda config: train.prepare(config.replace(method="sac"))  # asks nothing, and takes rewards as they are
     now = lambda given, training: round_at(index, given.state.key, training.settings.schedule)
@@ -88,11 +86,17 @@ def parts(structure: Config) -> dict[str, Callable[[Prepared, Config], Any]]:
             state.knowledge.surrogate, state.replay, given.preferences, filled, key, training.settings
         )
 
-    def value_parts(given: Prepared, config: Config) -> Any:
-        return train.value(peps.reward, given.state.knowledge, given.batches, train.prepare(config).settings)
+    def value_by(
+        way: Callable[..., Any],
+    ) -> Callable[[Prepared, Config], Any]:
+        def value(given: Prepared, config: Config) -> Any:
+            training, state = train.prepare(config), given.state
+            agent, at = training.settings.agent, now(given, training)
+            drawn = replay.draw(key, (agent.updates, agent.batch_size), at.filled)
+            reward = lambda rows: peps.reward(state.knowledge, rows, training.settings)
+            return way(reward, state.replay, drawn, at, training.settings)
 
-    def value_at_once(given: Prepared, config: Config) -> Any:
-        return peps.reward(given.state.knowledge, given.batches, train.prepare(config).settings)
+        return value
 
     def update(given: Prepared, config: Config) -> Any:
         training = plain(config)
@@ -105,8 +109,8 @@ def parts(structure: Config) -> dict[str, Callable[[Prepared, Config], Any]]:
         "ask": ask,
         "fit_dynamics": fit_dynamics,
         "fit_surrogate": fit_surrogate,
-        "value": value_parts,
-        AT_ONCE: value_at_once,
+        "value": value_by(train.values),
+        BY_MINIBATCH: value_by(lambda reward, buffer, drawn, *_: train.values_of_minibatches(reward, buffer, drawn)),
     }
     return {"collect": collect} | (learned if structure.method == "peps" else {}) | {"improve": update, "whole": whole}
 

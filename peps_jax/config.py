@@ -161,8 +161,10 @@ class Config:
     dynamics_updates: int = static(20, COUNT, "gradient steps on the dynamics in a round", group="models")
     dynamics_batch_size: int = static(256, COUNT, "transitions in a minibatch of the dynamics' fit", group="models")
     surrogate_learning_rate: Any = traced(5e-3, POSITIVE, "Adam's rate for the surrogate reward", group="models")
-    surrogate_updates: int = static(40, COUNT, "gradient steps on the surrogate reward in a round", group="models")
-    surrogate_batch_size: int = static(64, COUNT, "preferences in a minibatch of the surrogate's fit", group="models")
+    surrogate_updates: int = static(20, COUNT, "gradient steps on the surrogate reward in a round", group="models")
+    surrogate_batch_size: int = static(
+        32, COUNT, "answers in each member's minibatches of the surrogate's fit", group="models"
+    )
     surrogate_decay: Any = traced(1e-4, NOT_NEGATIVE, "weight decay of the surrogate's fit", group="models")
     level: str = static(
         "none", LEVELS, f"what pins the surrogate reward's level after the fit: {', '.join(LEVELS)}", group="models"

@@ -17,7 +17,7 @@ from flax import struct
 from jax import Array
 
 from peps_jax import generator, methods, rollout
-from peps_jax.config import Config, Problem
+from peps_jax.config import Config, Problem, capacity
 from peps_jax.learning import replay, sac, team
 from peps_jax.learning.surrogate import SurrogateState
 from peps_jax.methods import Method
@@ -25,11 +25,11 @@ from peps_jax.preferences import data
 from peps_jax.preferences.data import Answers, PreferenceSet, Queries
 from peps_jax.preferences.teachers import SYNTHETIC, Teacher
 from peps_jax.round import Round, round_at
-from peps_jax.settings import AgentSettings, Settings, settings_of
+from peps_jax.settings import AgentSettings, ScheduleSettings, Settings, settings_of
 from peps_jax.trajectory import Transition
 
-# Minibatches whose rewards are computed at once. All of a round's took two to three times as long on a CPU: what the ensembles'
-# layers put out didn't stay in the cache.
+# Minibatches whose rewards are computed at once, where they are computed one by one. All of a round's took two to three times as
+# long on a CPU: what the ensembles' layers put out didn't stay in the cache.
 VALUED_TOGETHER = 5
 
 
@@ -133,14 +133,13 @@ def _untaught(training: Training) -> TrainingState:
     settings, method = training.settings, training.method
     key_agent, key_knowledge, key_actors, key = jax.random.split(generator.key(training.config.seed), 4)
     spaces = settings.agent.observation_size, settings.agent.action_space
-    capacity = settings.schedule.room * settings.schedule.steps_per_round
     return TrainingState(
         agents=tuple(sac.init(key, settings.agent) for key in sac.agent_keys(key_agent, len(method.rewards))),
         knowledge=method.init(key_knowledge, settings),
         preferences=None,
         budget=None,
         replay=replay.init(
-            capacity,
+            settings.schedule.room * settings.schedule.steps_per_round,
             *spaces,
             settings.dynamics.perceived_size,
             told=settings.rollout.watched_envs == settings.rollout.num_envs,
@@ -193,7 +192,8 @@ def improve(state: TrainingState, now: Round, training: Training) -> tuple[tuple
     method, settings = training.method, training.settings
     key_batch, key_update = jax.random.split(now.keys.improve)
     shape = (settings.agent.updates, settings.agent.batch_size)
-    batches = replay.sample(state.replay, key_batch, shape, now.filled)
+    index = replay.draw(key_batch, shape, now.filled)
+    batches = replay.rows(state.replay, index)
     temperature = (now.temperature + method.entropy_weight(settings)) * settings.agent.reward_scale
     current = settings.agent.replace(learning_rate=now.learning_rate)
     keys = sac.agent_keys(key_update, len(method.rewards))
@@ -201,7 +201,11 @@ def improve(state: TrainingState, now: Round, training: Training) -> tuple[tuple
         batch=batches,
         # before the updates: what the method knows doesn't change within a round
         rewards=tuple(
-            value(reward, state.knowledge, batches, settings) * settings.agent.reward_scale for reward in method.rewards
+            values(
+                lambda rows, reward=reward: reward(state.knowledge, rows, settings), state.replay, index, now, settings
+            )
+            * settings.agent.reward_scale
+            for reward in method.rewards
         ),
         noises=tuple(sac.draw_noise(key, shape, settings.agent) for key in keys),
         key=jax.random.split(jax.random.fold_in(key_update, settings.agent.updates), settings.agent.updates),
@@ -212,11 +216,33 @@ def improve(state: TrainingState, now: Round, training: Training) -> tuple[tuple
     return agents, jax.tree.map(jnp.mean, infos)
 
 
-def value(
-    reward: Callable[[Any, Transition, Settings], Array], knowledge: Any, batches: Transition, settings: Settings
+def values(
+    reward: Callable[[Transition], Array], buffer: Transition, index: Array, now: Round, settings: Settings
 ) -> Array:
-    """A method's `reward` of minibatches (n, size), `VALUED_TOGETHER` at a time."""
-    return jax.lax.map(lambda batch: reward(knowledge, batch, settings), batches, batch_size=VALUED_TOGETHER)
+    """`reward` of rows `index` (updates, batch_size) of replay, by way of whichever is less: those rows, or all that are filled."""
+    schedule = settings.schedule
+    # a training of this length in a program with more room goes the same way
+    if capacity(schedule.room) * schedule.steps_per_round <= 2 * index.size:
+        return relabelled(reward, buffer, now, schedule)[index]
+    return values_of_minibatches(reward, buffer, index)
+
+
+def values_of_minibatches(reward: Callable[[Transition], Array], buffer: Transition, index: Array) -> Array:
+    """`reward` of rows `index` (updates, batch_size) of replay, `VALUED_TOGETHER` minibatches at a time."""
+    return jax.lax.map(reward, replay.rows(buffer, index), batch_size=VALUED_TOGETHER)
+
+
+def relabelled(
+    reward: Callable[[Transition], Array], buffer: Transition, now: Round, schedule: ScheduleSettings
+) -> Array:
+    """`reward` of all transitions so far, (room * steps_per_round,), a round's after the other; 0 behind them."""
+    steps = schedule.steps_per_round
+
+    def of_round(index: Array, values: Array) -> Array:
+        rows = jax.tree.map(lambda rows: jax.lax.dynamic_slice_in_dim(rows, index * steps, steps), buffer)
+        return jax.lax.dynamic_update_slice_in_dim(values, reward(rows), index * steps, 0)
+
+    return jax.lax.fori_loop(0, now.index + 1, of_round, jnp.zeros(schedule.room * steps, jnp.float32))
 
 
 def run_round(state: TrainingState, index: Array, training: Training) -> tuple[TrainingState, dict[str, Array]]:

@@ -12,7 +12,18 @@ from peps_jax import generator, grid
 from peps_jax.preferences.data import Answers
 from peps_jax.preferences.teachers import Teacher
 from peps_jax.round import annealed_temperature, round_at
-from peps_jax.train import collect_and_ask, finish, hear, init, learn_and_improve, prepare, run_round, run_rounds
+from peps_jax.train import (
+    collect_and_ask,
+    finish,
+    hear,
+    init,
+    learn_and_improve,
+    prepare,
+    relabelled,
+    run_round,
+    run_rounds,
+    values,
+)
 
 CURVES = {"return_", "explicability", "belief_gap", "length", "critic_loss", "policy_entropy", "temperature"}
 LEARNED = {"dynamics_loss", "surrogate_loss", "preference_accuracy"}
@@ -235,6 +246,32 @@ def test_replay_holds_what_happened(line, first_state, rounds):
     np.testing.assert_allclose(buffer.movement, buffer.action, atol=1e-4)  # 0.1 of it, in perceptual widths of 0.1
     assert buffer.terminated.dtype == bool
     np.testing.assert_array_equal(buffer.terminated, buffer.next_observation[:, 0] > 0.25)
+
+
+def test_rewards_are_the_same_of_minibatches_and_of_all_replay(line, first_state, rounds):
+    """Whichever is less work."""
+    training = prepare(line)
+    state, _ = rounds(first_state(training), jnp.arange(2, dtype=jnp.int32), training)
+    now = round_at(jnp.asarray(1, jnp.int32), state.key, training.settings.schedule)
+    filled, capacity = int(now.filled), state.replay.reward.shape[0]
+    assert filled < capacity
+    reward = lambda rows: training.method.rewards[0](state.knowledge, rows, training.settings)
+    few = jnp.arange(filled // 2)[None]
+    many = jnp.tile(jnp.arange(filled)[None], (2, 1))
+    assert few.size < capacity / 2 <= many.size
+    ways = [values(reward, state.replay, index, now, training.settings) for index in (few, many)]
+    assert [way.shape for way in ways] == [few.shape, many.shape]
+    for way in ways:
+        np.testing.assert_allclose(
+            way, np.broadcast_to(reward(state.replay)[: way.shape[1]], way.shape), rtol=1e-5, atol=1e-6
+        )
+    relabels = relabelled(reward, state.replay, now, training.settings.schedule)
+    np.testing.assert_array_equal(relabels[filled:], 0, "what isn't there yet costs nothing")
+    traced = [
+        jax.make_jaxpr(lambda index: values(reward, state.replay, index, now, training.settings))(index)
+        for index in (few, many)
+    ]
+    assert ["while" in str(one) for one in traced] == [False, True]
 
 
 def test_result_acts_by_mode_and_by_samples(line, train):

@@ -2,7 +2,7 @@
 
     python peers/imitation_drlhp.py --width 64 --steps 2000 [--wait]
 
-In a round of 400 steps 30 pairs are answered by r_A and every network of r-hat makes 40 steps on 64 pairs, as in peps_jax.
+In a round of 400 steps 30 pairs are answered by r_A and every network of r-hat makes 20 steps on 32 pairs, as in peps_jax.
 """
 
 import contextlib
@@ -20,7 +20,7 @@ from sb3_environment import NavigationVecEnv
 from stable_baselines3 import SAC
 
 STEPS_PER_ROUND, QUERIES_PER_ROUND, SEGMENT_LENGTH = 400, 30, 5
-MEMBERS, UPDATES, PAIRS, LEARNING_RATE = 5, 40, 64, 5e-3  # of r-hat
+MEMBERS, UPDATES, PAIRS, LEARNING_RATE = 5, 20, 32, 5e-3  # of r-hat
 WARMUP_ROUNDS = 2  # imitation makes a first round in any case
 
 

@@ -66,8 +66,8 @@ def fit(
     shape = (settings.updates, settings.ensemble_size, settings.batch_size)
     batches = replay.sample(buffer, key_batch, shape, filled)
     noises = jax.random.normal(key_noise, batches.movement.shape, jnp.float32)
-    of_one = lambda params, batch, noise: loss(params, batch, noise, settings)
-    *fitted, losses = fit_ensemble(
+    of_one = lambda params, batch, noise: (loss(params, batch, noise, settings), None)
+    *fitted, (losses, _) = fit_ensemble(
         of_one, optax.adam(settings.learning_rate), state.params, state.optimizer, batches, noises
     )
     return ClassifierState(*fitted), {"classifier_loss": jnp.mean(losses)}

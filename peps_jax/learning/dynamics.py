@@ -81,8 +81,10 @@ def fit(
     """`settings.updates` steps of Adam; each member draws minibatches of its own from the `filled` rows of replay."""
     shape = (settings.updates, settings.ensemble_size, settings.batch_size)
     batches = replay.sample(buffer, key, shape, filled)
-    of_one = lambda params, batch: loss(params, batch, settings)
-    *fitted, losses = fit_ensemble(of_one, optax.adam(settings.learning_rate), state.params, state.optimizer, batches)
+    of_one = lambda params, batch: (loss(params, batch, settings), None)
+    *fitted, (losses, _) = fit_ensemble(
+        of_one, optax.adam(settings.learning_rate), state.params, state.optimizer, batches
+    )
     return DynamicsState(*fitted), {"dynamics_loss": jnp.mean(losses)}
 
 

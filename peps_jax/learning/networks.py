@@ -182,27 +182,27 @@ def apply_ensemble(network: nn.Module) -> Callable[[Any, Array], Array]:
 
 
 def fit_ensemble(
-    loss: Callable[..., Array],
+    loss: Callable[..., tuple[Array, Any]],
     optimizer: optax.GradientTransformation,
     params: Any,
     optimizer_state: Any,
     *minibatches: Any,
-) -> tuple[Any, Any, Array]:
+) -> tuple[Any, Any, tuple[Array, Any]]:
     """A gradient step of every member on each of its own minibatches.
 
     Args:
-      loss: (one member's parameters, *a minibatch) -> ().
+      loss: (one member's parameters, *a minibatch) -> (), and other figures () of it.
       minibatches: pytrees with leading axes (updates, members).
 
     Returns:
-      parameters, the optimizer's state, and the members' mean loss at each update, (updates,).
+      parameters, the optimizer's state, and the loss and figures of every update and member, (updates, members).
     """
 
-    def update(state: tuple[Any, Any], minibatch: tuple[Any, ...]) -> tuple[tuple[Any, Any], Array]:
+    def update(state: tuple[Any, Any], minibatch: tuple[Any, ...]) -> tuple[tuple[Any, Any], tuple[Array, Any]]:
         params, optimizer_state = state
-        losses, grads = jax.vmap(jax.value_and_grad(loss))(params, *minibatch)
-        updates, optimizer_state = optimizer.update(grads, optimizer_state)
-        return (optax.apply_updates(params, updates), optimizer_state), jnp.mean(losses)
+        losses, grads = jax.vmap(jax.value_and_grad(loss, has_aux=True))(params, *minibatch)
+        updates, optimizer_state = optimizer.update(grads, optimizer_state, params)
+        return (optax.apply_updates(params, updates), optimizer_state), losses
 
     (params, optimizer_state), losses = jax.lax.scan(update, (params, optimizer_state), minibatches)
     return params, optimizer_state, losses

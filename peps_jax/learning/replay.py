@@ -51,5 +51,14 @@ def add(buffer: Transition, transitions: Transition, position: Array) -> Transit
 
 def sample(buffer: Transition, key: Array, shape: tuple[int, ...], filled: Array) -> Transition:
     """Transitions of shape `shape` drawn uniformly, with replacement, from the first `filled` rows."""
-    index = jax.random.randint(key, shape, 0, filled)
+    return rows(buffer, draw(key, shape, filled))
+
+
+def draw(key: Array, shape: tuple[int, ...], filled: Array) -> Array:
+    """Which rows `sample` takes, (*shape)."""
+    return jax.random.randint(key, shape, 0, filled)
+
+
+def rows(buffer: Transition, index: Array) -> Transition:
+    """The transitions in rows `index` (...)."""
     return jax.tree.map(lambda rows: rows[index], buffer)

@@ -22,7 +22,7 @@ def config(line):
     """A fit of many steps."""
     return settings(
         line.replace(
-            surrogate_updates=400, surrogate_batch_size=64, surrogate_learning_rate=1e-2, surrogate_decay=0.0,
+            surrogate_updates=400, surrogate_batch_size=32, surrogate_learning_rate=1e-2, surrogate_decay=0.0,
             model_hidden_sizes=(16,), prior="none", uniform_answers=0.0,
         )
     ).surrogate  # fmt: skip
@@ -67,53 +67,81 @@ def taught(preferences, config):
     return surrogate.pin(state, *visited(key_visited), config), info
 
 
-def examples_of(segments, preferred, config, weights=None):
+def examples_of(segments, preferred):
     """What the loss sees of `segments`."""
     features = jnp.concatenate([segments.observation, segments.action], -1)
     number = segments.mask.shape[0]
-    weights = jnp.ones((number, config.ensemble_size)) if weights is None else weights
     preferred = jnp.broadcast_to(jnp.asarray(preferred, jnp.float32), number)
-    return Examples(features, segments.mask, segments.reward, preferred, weights)
+    return Examples(features, segments.mask, segments.reward, preferred, jnp.ones(number))
+
+
+def a_member(config):
+    """Parameters of an untrained network."""
+    return jax.tree.map(lambda leaf: leaf[0], surrogate.init(jax.random.key(0), config).params)
 
 
 def test_loss_is_log_2_at_a_tie(config):
-    state = surrogate.init(jax.random.key(0), config)
-    examples = examples_of(random_segments(jax.random.key(1), 6), jnp.array([1.0, 0, 1, 0, 0.5, 1]), config)
-    nothing = jax.tree.map(jnp.zeros_like, state.params)
+    params = a_member(config)
+    examples = examples_of(random_segments(jax.random.key(1), 6), jnp.array([1.0, 0, 1, 0, 0.5, 1]))
+    nothing = jax.tree.map(jnp.zeros_like, params)
     np.testing.assert_allclose(surrogate.loss(nothing, examples, config)[0], math.log(2), rtol=1e-6)
     equal = examples._replace(features=jnp.repeat(examples.features[:, :1], 2, 1))
-    value, _ = surrogate.loss(state.params, equal, config)
+    value, _ = surrogate.loss(params, equal, config)
     np.testing.assert_allclose(value, math.log(2), rtol=1e-6)
 
 
 def test_steps_after_a_segments_end_have_no_influence(config):
-    state = surrogate.init(jax.random.key(0), config)
     mask = jnp.ones((6, 2, STEPS), bool).at[:, 0, 2:].set(False)
     segments = random_segments(jax.random.key(1), 6, mask)
-    examples = examples_of(segments, 1.0, config)
+    examples = examples_of(segments, 1.0)
     other = examples._replace(features=jnp.where(mask[..., None], examples.features, 100.0))
     gradient = jax.grad(lambda params, examples: surrogate.loss(params, examples, config)[0])
-    each = (jax.tree.leaves(gradient(state.params, examples)) for examples in (examples, other))
+    each = (jax.tree.leaves(gradient(a_member(config), examples)) for examples in (examples, other))
     for one, two in zip(*each, strict=True):
         np.testing.assert_allclose(one, two, atol=1e-6)
+    state = surrogate.init(jax.random.key(0), config)
     assert bool(jnp.any(surrogate.preference_logits(state, segments, config) != 0))
 
 
 def test_a_tie_counts_half_for_each(config):
-    state = surrogate.init(jax.random.key(0), config)
     segments = random_segments(jax.random.key(1), 6)
-    loss = lambda answer: surrogate.loss(state.params, examples_of(segments, answer, config), config)[0]
+    loss = lambda answer: surrogate.loss(a_member(config), examples_of(segments, answer), config)[0]
     np.testing.assert_allclose(loss(0.5), (loss(0.0) + loss(1.0)) / 2, rtol=1e-6)
     assert float(loss(0.0)) != float(loss(1.0))
 
 
-def test_weights_choose_what_a_member_sees(config):
+def test_an_example_of_no_weight_costs_nothing(config):
+    params = a_member(config)
+    examples = examples_of(random_segments(jax.random.key(1), 2), 1.0)._replace(weight=jnp.array([0.0, 2.0]))
+    value, _ = surrogate.loss(params, examples, config)
+    sums = surrogate.segment_sums(params, examples.features, examples.mask, examples.reward, config)
+    np.testing.assert_allclose(value, np.logaddexp(0, -(sums[1, 0] - sums[1, 1])), rtol=1e-5)
+
+
+def test_each_member_draws_from_its_own_resample_in_proportion(config):
+    """What nobody has answered is in no minibatch, and a member with an empty resample learns nothing."""
+    config = config.replace(updates=50)
     state = surrogate.init(jax.random.key(0), config)
-    weights = jnp.zeros((2, config.ensemble_size)).at[1, 0].set(2.0)
-    examples = examples_of(random_segments(jax.random.key(1), 2), 1.0, config, weights)
-    value, _ = surrogate.loss(state.params, examples, config)
-    sums = surrogate.segment_sums(state.params, examples.features, examples.mask, examples.reward, config)
-    np.testing.assert_allclose(value, np.logaddexp(0, -(sums[0, 1, 0] - sums[0, 1, 1])), rtol=1e-5)
+    segments = random_segments(jax.random.key(1), 12)
+    segments = segments._replace(reward=jnp.broadcast_to(jnp.arange(12.0)[:, None, None], segments.reward.shape))
+    people = (jnp.arange(12) % 4).astype(jnp.float32)  # who answered each
+    preferences = data.recording(segments, numbered(jnp.ones(12), people))
+    drawn = surrogate._minibatches(state, preferences, jax.random.key(2), config)
+    assert drawn.features.shape[:3] == (50, config.ensemble_size, config.batch_size)
+    which = np.asarray(drawn.reward[..., 0, 0], int)
+    counts = np.asarray(surrogate.counts(state, preferences, config))
+    for member in range(config.ensemble_size):
+        share = np.bincount(which[:, member].ravel(), minlength=12) / which[:, member].size
+        np.testing.assert_allclose(share, counts[:, member] / counts[:, member].sum(), atol=0.05)
+        assert not share[counts[:, member] == 0].any()
+    alone = preferences.replace(weight=(jnp.arange(12) == np.argmin(counts.min(1) + 100 * (counts.max(1) == 0))) * 1.0)
+    empty = np.asarray(surrogate.counts(state, alone, config)).sum(0) == 0
+    assert empty.any()
+    assert not empty.all()
+    taught, _ = surrogate.fit(state, alone, jax.random.key(3), config.replace(decay=jnp.float32(0)))
+    for before, after in zip(*map(jax.tree.leaves, (state.params, taught.params)), strict=True):
+        np.testing.assert_array_equal(before[empty], after[empty])
+        assert not np.array_equal(before[~empty], after[~empty])
 
 
 def test_resamples_are_poisson_and_follow_from_a_querys_number():
@@ -157,8 +185,8 @@ def test_it_makes_no_difference_in_which_order_answers_came(config):
     for now, some in ((0, numbers[: NUMBER // 2]), (7, numbers[NUMBER // 2 :])):
         late = data.file(late, Answers(jnp.asarray(some), preferred[some], jnp.ones(len(some))), jnp.asarray(now))
     state = surrogate.init(jax.random.key(0), config)
-    weights = lambda preferences: surrogate._examples(state, preferences, config).weights
-    np.testing.assert_array_equal(weights(late), weights(at_once)[order])  # a member's resample holds the same queries
+    counts = lambda preferences: surrogate.counts(state, preferences, config)
+    np.testing.assert_array_equal(counts(late), counts(at_once)[order])  # a member's resample holds the same queries
     fit = jax.jit(lambda preferences: surrogate.fit(state, preferences, jax.random.key(5), config))
     jax.tree.map(
         lambda one, two: np.testing.assert_allclose(one, two, rtol=1e-6, atol=1e-7),
@@ -174,27 +202,26 @@ def test_an_answer_of_three_people_counts_as_three(config):
     three = data.recording(segments, numbered(jnp.array([1.0, 0.0]), jnp.array([3.0, 1.0])))
     each = data.recording(segments, Answers(jnp.array([0, 0, 1, 0]), jnp.array([1.0, 1.0, 0.0, 1.0]), jnp.ones(4)))
     jax.tree.map(np.testing.assert_array_equal, three, each)
-    examples = surrogate._examples(state, three, config)
     copies = surrogate.resampled(state.bootstrap, jnp.arange(2), config.ensemble_size)
-    np.testing.assert_array_equal(examples.weights, copies * np.array([[3.0], [1.0]]))
+    np.testing.assert_array_equal(surrogate.counts(state, three, config), copies * np.array([[3.0], [1.0]]))
 
 
 def test_an_answer_of_three_people_costs_as_much_as_three_equal_answers(config):
-    """In the loss and in its gradient: a query's copies in a resample are multiplied, not drawn anew for each person."""
-    state = surrogate.init(jax.random.key(0), config)
+    """In the loss and in its gradient."""
+    params = a_member(config)
     segments = random_segments(jax.random.key(1), 4)
     preferred = jnp.array([1.0, 0.0, 0.5, 1.0])
     weighed = data.recording(segments, numbered(preferred, jnp.array([3.0, 1.0, 2.0, 1.0])))
     each = jnp.array([0, 0, 0, 1, 2, 2, 3])
     copied = data.recording(segments, numbered(preferred))
     copied = jax.tree.map(lambda rows: rows[each], copied)
-    cost = lambda params, rows: surrogate.loss(params, surrogate._examples(state, rows, config), config)
-    (value, accuracy), gradient = jax.value_and_grad(cost, has_aux=True)(state.params, weighed)
-    (same, as_accurate), expected = jax.value_and_grad(cost, has_aux=True)(state.params, copied)
+    cost = lambda params, rows: surrogate.loss(params, surrogate._examples(rows, config), config)
+    (value, accuracy), gradient = jax.value_and_grad(cost, has_aux=True)(params, weighed)
+    (same, as_accurate), expected = jax.value_and_grad(cost, has_aux=True)(params, copied)
     np.testing.assert_allclose([value, accuracy], [same, as_accurate], rtol=1e-6)
     jax.tree.map(lambda one, two: np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-7), gradient, expected)
     alone = data.recording(segments, numbered(preferred))
-    assert abs(float(cost(state.params, alone)[0] - value)) > 1e-5, "how many people say so counts"
+    assert abs(float(cost(params, alone)[0] - value)) > 1e-5, "how many people say so counts"
 
 
 def test_fit_recovers_the_ranking_of_a_linear_reward(config):
@@ -315,9 +342,8 @@ def test_uniform_answers_bound_the_likelihood(config):
     assert bool(jnp.all(jnp.isfinite(slope)))
     np.testing.assert_array_equal(surrogate.answer_logits(difference, 0.0), difference)
 
-    state = surrogate.init(jax.random.key(0), config)
-    examples = examples_of(random_segments(jax.random.key(1), 6), 0.0, config)
-    sure = jax.tree.map(lambda leaf: 1e3 * leaf, state.params)
+    examples = examples_of(random_segments(jax.random.key(1), 6), 0.0)
+    sure = jax.tree.map(lambda leaf: 1e3 * leaf, a_member(config))
     loss = lambda config: float(surrogate.loss(sure, examples, config)[0])
     assert loss(config) > -math.log(0.05)
     assert loss(config.replace(uniform_answers=0.1)) <= -math.log(0.05) + 1e-5, "an error costs at most this"

@@ -34,7 +34,7 @@ SETTINGS = dict(
     hold_steps=2, reward_scale=0.25, policy_entropy_weight=0.02, initial_temperature=2.0, temperature=0.01,
     segment_length=HORIZON, num_queries=1, surrogate_learning_rate=2e-3,  # nothing is asked: all was said before
     # answers are many, and r-hat is learned from them alone, as in the paper
-    prior="none", exploration=0.2, critic_normalisation=False, learning_rate=1e-3, batch_size=256,
+    prior="none", surrogate_updates=40, exploration=0.2, critic_normalisation=False, learning_rate=1e-3, batch_size=256,
     product="gaussians",  # of discrete actions
 )  # fmt: skip
 LAMS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)  # over which PEPS is shown
