@@ -68,8 +68,8 @@ def call(name: str, script: str, *arguments: object) -> str:
     return _call([python_of(name), "-W", "ignore", SCRIPTS / script, *arguments], _surroundings(name))
 
 
-def measure(name: str, script: str, arguments: Sequence[object], processes: int) -> Answer:
-    """Runs `processes` of a script that follows `peers/protocol.py`: warm together, timed together.
+def answers(name: str, script: str, arguments: Sequence[Sequence[object]]) -> list[dict[str, Any]]:
+    """What processes of a script that follows `peers/protocol.py` answer, each called with its own: warm together, timed together.
 
     One process has all cores; several have one each.
 
@@ -78,22 +78,27 @@ def measure(name: str, script: str, arguments: Sequence[object], processes: int)
     """
     python, running = python_of(name), []
     try:
-        for process in range(processes):
-            command = [python, "-W", "ignore", SCRIPTS / script, *arguments, "--wait"]
-            running.append(_start(command, _surroundings(name), CORES if processes == 1 else [CORES[process]]))
+        for process, own in enumerate(arguments):
+            command = [python, "-W", "ignore", SCRIPTS / script, *own, "--wait"]
+            running.append(_start(command, _surroundings(name), CORES if len(arguments) == 1 else [CORES[process]]))
         for started in running:
             _next_line(started, "ready")
         for started in running:
             started.process.stdin.write("go\n")
             started.process.stdin.flush()
-        answers = [json.loads(_next_line(started, "{")) for started in running]
+        return [json.loads(_next_line(started, "{")) for started in running]
     finally:
         for started in running:
             started.process.kill()
             started.process.communicate()
             started.errors.close()
-    rate = sum(answer["steps"] / answer["seconds"] for answer in answers)
-    return Answer(rate, max(answer["preparation"] for answer in answers))
+
+
+def measure(name: str, script: str, arguments: Sequence[object], processes: int) -> Answer:
+    """The rate of `processes` of a script. Raises Missing."""
+    said = answers(name, script, [arguments] * processes)
+    rate = sum(answer["steps"] / answer["seconds"] for answer in said)
+    return Answer(rate, max(answer["preparation"] for answer in said))
 
 
 def best(name: str, script: str, arguments: Sequence[object], quick: bool = False) -> dict[str, Any]:

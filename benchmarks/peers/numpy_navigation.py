@@ -73,25 +73,31 @@ class Navigation(gymnasium.Env):
 
 
 class ManyNavigations:
-    """`count` environments in one array; what ends begins anew."""
+    """`count` environments in one array; what ends begins anew, or, `absorbing`, stays for nothing until the time is up."""
 
-    def __init__(self, count: int):
-        self.count = count
+    def __init__(self, count: int, absorbing: bool = False):
+        self.count, self.absorbing = count, absorbing
         self.reset()
 
     def reset(self) -> np.ndarray:
         self._positions, self._times = np.tile(START, (self.count, 1)), np.zeros(self.count, int)
+        self._absorbed = np.zeros(self.count, bool)
         return observe(self._positions)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Observations after the step, those to act on next, rewards, terminated and truncated."""
-        self._positions, rewards, terminated = move(self._positions, actions)
+        after, rewards, terminated = move(self._positions, actions)
+        if self.absorbing:
+            after = np.where(self._absorbed[:, None], self._positions, after)
+            rewards = np.where(self._absorbed, 0.0, rewards)
+            self._absorbed, terminated = self._absorbed | terminated, np.zeros(self.count, bool)
+        self._positions = after
         self._times += 1
         truncated = (self._times >= protocol.HORIZON) & ~terminated
         reached = following = observe(self._positions)
         over = terminated | truncated
         if over.any():
-            self._positions[over], self._times[over] = START, 0
+            self._positions[over], self._times[over], self._absorbed[over] = START, 0, False
             following = np.where(over[:, None], observe(START[None]), reached)
         return reached, following, rewards.astype(np.float32), terminated, truncated
 

@@ -22,6 +22,9 @@ LEARNING_RATE = 1e-3
 DISCOUNT = 0.995
 TARGET_RATE = 0.01
 HORIZON = 200
+# where the time to a return is taken
+LEVEL = 80.0  # return of who arrives, and takes some 25 steps instead of 8
+WATCHED_EVERY = 5  # rounds
 
 
 def arguments(description: str) -> argparse.Namespace:

@@ -10,9 +10,9 @@ from stable_baselines3.common.vec_env import VecEnv
 class NavigationVecEnv(VecEnv):
     """`count` environments side by side."""
 
-    def __init__(self, count: int):
+    def __init__(self, count: int, absorbing: bool = False):
         super().__init__(count, Navigation.observation_space, Navigation.action_space)
-        self._environments, self._actions = ManyNavigations(count), None
+        self._environments, self._actions = ManyNavigations(count, absorbing), None
 
     def reset(self) -> np.ndarray:
         return self._environments.reset()

@@ -25,7 +25,7 @@ from peps_jax.reproduce.summary import (
 from peps_jax.storage.tables import markdown
 
 ABOUT = "arrival, return and explicability over the number of answers"
-SEEDS = 5  # a training that loses its task shows in few
+SEEDS = 20  # a training that loses its task is rare
 SHARES = (0, 1 / 3, 1, 10)  # of the plan's queries
 VARIANTS: dict[str, tuple[str, dict[str, Any], str]] = {  # method, changes, colour
     "PEPS": ("peps", {}, colour_of("peps")),
