@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -69,15 +68,14 @@ class Display(batches.Watch):
         if self._live:
             self._live.stop()
 
-    def say(self, text: str) -> None:
-        """What happens now."""
-        self._doing = text
-        self._bar.update(self._task, description=text)
-        self._reminder.about(text)
-        news = re.sub(r", batch \d+/\d+", "", text)  # many batches are soon done, and alike
-        if not self._live and news not in self._said:
-            print_line(f"{self._name}{text}")
-            self._said.add(news)
+    def say(self, text: str, number: str = "") -> None:
+        """What happens now, and to which batch; of lines that differ in its `number` alone the first is printed."""
+        self._doing = text + number
+        self._bar.update(self._task, description=self._doing)
+        self._reminder.about(self._doing)
+        if not self._live and text not in self._said:
+            print_line(f"{self._name}{self._doing}")
+            self._said.add(text)
             self._printed = time.perf_counter()
 
     def _remind(self, text: str) -> None:
@@ -87,14 +85,15 @@ class Display(batches.Watch):
             print_line(f"{self._name}{text}")
 
     def compiling(self, batch: batches.Batch) -> None:
-        self.say(f"compiling {self._described(batch)}")
+        self.say(f"compiling {self._described(batch)}", self._number(batch))
 
     def start(self, batch: batches.Batch) -> None:
         self.begin(batch, 0)
 
     def begin(self, batch: batches.Batch, rounds: int) -> None:
         """A batch starts to run, `rounds` of which an earlier run made."""
-        self.say(f"training {self._described(batch)}" + f", from round {rounds} on" * (rounds > 0))
+        since = f" from round {rounds} on" * (rounds > 0)
+        self.say(f"training {self._described(batch)}{since}", self._number(batch))
         self._done += rounds * self._steps_per_round(batch)
         self._before, self._started = self._done, time.perf_counter()
 
@@ -102,9 +101,10 @@ class Display(batches.Watch):
         self._keep(batch, runs, times)
 
     def _described(self, batch: batches.Batch) -> str:
-        number = f", batch {self._batches.index(batch) + 1}/{len(self._batches)}" * (len(self._batches) > 1)
-        runs = f"{len(batch.runs)} run" + "s" * (len(batch.runs) > 1)
-        return f"{self._configs[batch.runs[0]].method}, {runs}{number}"
+        return f"{self._configs[batch.runs[0]].method}, {len(batch.runs)} run" + "s" * (len(batch.runs) > 1)
+
+    def _number(self, batch: batches.Batch) -> str:
+        return f", batch {self._batches.index(batch) + 1}/{len(self._batches)}" * (len(self._batches) > 1)
 
     def _steps_per_round(self, batch: batches.Batch) -> int:
         return sum(self._configs[place].steps_per_round for place in batch.runs)
@@ -127,6 +127,6 @@ class Display(batches.Watch):
             share, left = 100 * self._done / self._total, (self._total - self._done) / speed
             print_line(f"{self._name}{self._doing}: {share:.0f} %, {left:.0f} s left, {self._figures}")
         if rounds == self._configs[batch.runs[0]].num_rounds:
-            self._reminder.about(f"evaluating {self._described(batch)}")
+            self._reminder.about(f"evaluating {self._described(batch)}{self._number(batch)}")
         else:
             self._reminder.about(f"{self._doing}: {rounds} rounds are done, the next ones take")
