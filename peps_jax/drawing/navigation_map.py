@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+ORDER = ("goal", "pit", "ice", "sand", "firm sand", "wall")  # in which a key names them
+START = dict(marker="o", markersize=7, color="white", markeredgecolor=INK, markeredgewidth=1.3)
 SOLID = ("wall", "pit", "goal")  # what hides a heat map below it; all else is outlined on it
 
 
@@ -38,6 +41,24 @@ def draw_map(axes: Axes, params: NavigationParams, heat: bool = False) -> None:
             _outline(axes, area)
         if area.colour != "wall":
             _name(axes, area)
+
+
+def key_below(figure: Figure, shown: Iterable[NavigationParams]) -> None:
+    """What the colours on the maps of `shown` are, as one row under all panels."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    roles = {area.colour for params in shown for area in ground(params).shapes[1:]}
+    areas = [Patch(color=pictures.colour(role), label=role) for role in ORDER if role in roles]
+    start = Line2D([], [], linestyle="", label="start", **START)
+    figure.legend(
+        handles=[start, *areas],
+        frameon=False,
+        fontsize=9,
+        loc="outside lower center",
+        ncols=1 + len(areas),
+        handlelength=1.2,
+    )
 
 
 def _outline(axes: Axes, area: Rectangle) -> None:
@@ -68,8 +89,7 @@ def draw_route(axes: Axes, route: np.ndarray, method: str, alpha: float, width: 
 
 def draw_start(axes: Axes, params: NavigationParams) -> None:
     """Where every route begins."""
-    start = dict(marker="o", markersize=7, color="white", markeredgecolor=INK, markeredgewidth=1.3)
-    axes.plot(*np.asarray(params.start), zorder=4, **start)
+    axes.plot(*np.asarray(params.start), zorder=4, **START)
 
 
 def draw_heat(figure: Figure, axes: Axes, values: np.ndarray, params: NavigationParams) -> None:

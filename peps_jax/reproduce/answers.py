@@ -33,7 +33,8 @@ VARIANTS: dict[str, tuple[str, dict[str, Any], str]] = {  # method, changes, col
     "DRLHP": ("drlhp", {}, colour_of("drlhp")),
     "policy shaping": ("policy_shaping", {}, colour_of("policy_shaping")),
 }
-SHOWN = {"explicability": "explicability", "arrived": "share of seeds that arrive"}
+SHOWN = {"explicability": "explicability", "return": "return", "arrived": "share of seeds that arrive"}
+APART = 0.06  # between two variants' points at one number of answers, which would hide one another
 _NOTE = """\
 Arrived: the share of seeds whose mode reaches the goal; scores are interquartile means over up to {seeds} seeds with a 95 %
 interval, seeds that don't arrive among them. SAC asks nothing; the planner knows everything.
@@ -88,36 +89,50 @@ def write(plan: Plan, folder: Path) -> list[Path]:
 
 
 def _picture(plan: Plan, lines: list[Line]) -> Any:
-    figure, panels = panels_of(len(SHOWN), len(DOMAINS), 2.9, 2.5)
+    """A row for each of `SHOWN`, a column for each domain; scores with their intervals."""
+    figure, panels = panels_of(len(SHOWN), len(DOMAINS), 2.9, 2.3)
     asked = budgets(plan.base)
     for column, domain in enumerate(DOMAINS):
         own = [line for line in lines if line["domain"] == domain]
-        level = {
-            "planner": explicability(plan.record(plan.planned(domain, "peps"))),
-            "SAC": next(line["explicability"] for line in own if line["method"] == "SAC"),
+        sac = next(line for line in own if line["method"] == "SAC")
+        planned = plan.record(plan.planned(domain, "peps"))
+        levels = {
+            "planner": {"explicability": explicability(planned), "return": planned.mean("return")},
+            "SAC": {score: sac[score] for score in ("explicability", "return")},
         }
         for row, (score, words) in enumerate(SHOWN.items()):
             axes = panels[row, column]
             tidy(axes)
-            for variant, (_, _, colour) in VARIANTS.items():
+            for place, (variant, (_, _, colour)) in enumerate(VARIANTS.items()):
                 points = [line for line in own if line["method"] == variant]
-                places = [asked.index(line["answers"]) for line in points]
-                axes.plot(places, [line[score] for line in points], "o-", color=colour, linewidth=1.6, markersize=4,
-                          label=variant)  # fmt: skip
+                x = [asked.index(line["answers"]) + APART * (place - (len(VARIANTS) - 1) / 2) for line in points]
+                _points(axes, x, points, score, dict(color=colour, label=variant))
             axes.set_xticks(range(len(asked)), [f"{budget:,}" for budget in asked])
             if column == 0:
                 axes.set_ylabel(words, color=INK, fontsize=9)
-        top, bottom = panels[:, column]
-        for name, colour in {"planner": INK, "SAC": QUIET}.items():
-            bound(top, name, level[name], colour)
-        gap = max(level["planner"] - level["SAC"], 4.0) if math.isfinite(level["SAC"]) else 10.0
-        # whoever loses the task is far below, and shows in the row beneath
-        top.set_ylim(level["planner"] - 1.6 * gap, level["planner"] + 0.2 * gap)
-        top.set_title(title(domain), color=INK, fontsize=11)
-        bottom.set_ylim(-0.05, 1.05)
-        bottom.set_xlabel("answers", color=INK, fontsize=9)
+            if score != "arrived":
+                for (name, level), colour in zip(levels.items(), (INK, QUIET), strict=True):
+                    bound(axes, name, level[score], colour)
+                axes.set_ylim(*_range(*(level[score] for level in levels.values())))
+        panels[0, column].set_title(title(domain), color=INK, fontsize=11)
+        panels[-1, column].set_ylim(-0.05, 1.05)
+        panels[-1, column].set_xlabel("answers", color=INK, fontsize=9)
     legend_below(figure, panels[0, 0])
     return figure
+
+
+def _points(axes: Any, x: list[float], points: list[Line], score: str, style: dict[str, Any]) -> None:
+    y = [line[score] for line in points]
+    axes.plot(x, y, "o-", linewidth=1.6, markersize=4, **style)
+    if score != "arrived":
+        axes.vlines(x, *([line[f"{score}_{end}"] for line in points] for end in ("low", "high")), color=style["color"],
+                    linewidth=1.1)  # fmt: skip
+
+
+def _range(planner: float, sac: float) -> tuple[float, float]:
+    """What of a score is shown: whoever loses the task is far below, and shows in the row of arrivals."""
+    gap = max(abs(planner - sac), 4.0) if math.isfinite(sac) else 10.0
+    return min(planner, sac) - 0.8 * gap, max(planner, sac) + 0.2 * gap
 
 
 def _table(plan: Plan, lines: list[Line]) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import peps_envs
-from peps_jax.drawing.navigation_map import draw_map, draw_route, draw_start
+from peps_jax.drawing.navigation_map import draw_map, draw_route, draw_start, key_below
 from peps_jax.drawing.panels import INK, panels_of
 from peps_jax.reproduce.plan import DOMAINS, METHODS, Need, Plan
 from peps_jax.reproduce.summary import TITLES, explicability, title, write_picture
@@ -45,4 +45,5 @@ def write(plan: Plan, folder: Path) -> list[Path]:
             if row == 0:
                 axes.set_title(TITLES[method], color=INK, fontsize=11)
         panels[row, 0].set_ylabel(title(domain), color=INK, fontsize=11)
+    key_below(figure, [peps_envs.make(domain).params for domain in DOMAINS])
     return write_picture(figure, lines, folder, "figure2")

@@ -18,7 +18,7 @@ from peps_jax import methods
 from peps_jax.analysis import episodes
 from peps_jax.analysis.surrogate_maps import has_map, rank_correlation, surrogate_values
 from peps_jax.drawing import scenes
-from peps_jax.drawing.navigation_map import draw_heat, draw_map, draw_route, draw_start
+from peps_jax.drawing.navigation_map import draw_heat, draw_map, draw_route, draw_start, key_below
 from peps_jax.drawing.panels import INK, QUIET, colour_of, panels_of, save, tidy
 from peps_jax.sweep.results import PICTURES, Row
 
@@ -180,6 +180,9 @@ def routes(rows: Sequence[Row], episodes: int = 3) -> Figure | None:
                 axes.set_title(method if lam is None else _label(method, lam), color=INK, fontsize=10)
             if column == 0:
                 axes.set_ylabel(env, color=INK, fontsize=10)
+    maps = [row.run.training.problem.params for row in rows if has_map(row.run)]
+    if maps:
+        key_below(figure, maps)
     return figure
 
 
