@@ -86,9 +86,7 @@ def parts(structure: Config) -> dict[str, Callable[[Prepared, Config], Any]]:
             state.knowledge.surrogate, state.replay, given.preferences, filled, key, training.settings
         )
 
-    def value_by(
-        way: Callable[..., Any],
-    ) -> Callable[[Prepared, Config], Any]:
+    def value_by(way: Callable[..., Any]) -> Callable[[Prepared, Config], Any]:
         def value(given: Prepared, config: Config) -> Any:
             training, state = train.prepare(config), given.state
             agent, at = training.settings.agent, now(given, training)

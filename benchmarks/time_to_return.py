@@ -21,11 +21,11 @@ import peer
 import timing
 from training import COMPARISONS, seeds_of
 
-from peps_jax import Config, evaluate
+from peps_jax import Config
 from peps_jax.command_line import use_every_core
-from peps_jax.execution.program import stack
+from peps_jax.execution.program import begin, score, stack
 from peps_jax.storage.tables import markdown
-from peps_jax.train import TrainingState, finish, init, prepare, run_rounds
+from peps_jax.train import TrainingState, prepare, run_rounds
 
 sys.path.append(str(peer.SCRIPTS))
 protocol: Any = importlib.import_module("protocol")  # the peers'
@@ -51,14 +51,10 @@ def ours() -> tuple[list[Reached], float]:
     def further(state: TrainingState, first: jax.Array, config: Config) -> TrainingState:
         return run_rounds(state, first + spans, prepare(config))[0]
 
-    def score(state: TrainingState, config: Config) -> jax.Array:
-        return jnp.mean(evaluate(finish(state, {}, prepare(config)), EPISODES).return_)
-
-    begin, _ = timing.compiled(lambda config: init(prepare(config)), configs)
-    state = begin(configs)
+    state = timing.compiled(begin, configs)[0](configs)
     at = lambda first: timing.spread(jnp.full(jax.device_count(), first, jnp.int32))
     advance, compilation = timing.compiled(further, state, at(0), configs)
-    value, _ = timing.compiled(score, state, configs)
+    value, _ = timing.compiled(lambda *given: jnp.mean(score(*given, EPISODES).return_), state, configs)
     reached: list[Reached | None] = [None] * jax.device_count()
     seconds = 0.0
     for first in range(0, config.num_rounds, protocol.WATCHED_EVERY):

@@ -197,16 +197,15 @@ def improve(state: TrainingState, now: Round, training: Training) -> tuple[tuple
     temperature = (now.temperature + method.entropy_weight(settings)) * settings.agent.reward_scale
     current = settings.agent.replace(learning_rate=now.learning_rate)
     keys = sac.agent_keys(key_update, len(method.rewards))
+
+    def scaled(reward: Callable[[Any, Transition, Settings], Array]) -> Array:
+        of_rows = lambda rows: reward(state.knowledge, rows, settings)
+        return values(of_rows, state.replay, index, now, settings) * settings.agent.reward_scale
+
     steps = team.Step(
         batch=batches,
         # before the updates: what the method knows doesn't change within a round
-        rewards=tuple(
-            values(
-                lambda rows, reward=reward: reward(state.knowledge, rows, settings), state.replay, index, now, settings
-            )
-            * settings.agent.reward_scale
-            for reward in method.rewards
-        ),
+        rewards=tuple(map(scaled, method.rewards)),
         noises=tuple(sac.draw_noise(key, shape, settings.agent) for key in keys),
         key=jax.random.split(jax.random.fold_in(key_update, settings.agent.updates), settings.agent.updates),
     )

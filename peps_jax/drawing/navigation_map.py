@@ -11,7 +11,7 @@ from peps_envs import pictures
 from peps_envs.navigation import NavigationParams
 from peps_envs.navigation.scene import ground
 from peps_envs.scene import Rectangle
-from peps_jax.drawing.panels import INK, QUIET, colour_of
+from peps_jax.drawing.panels import INK, QUIET, colour_of, row_below
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,14 +51,7 @@ def key_below(figure: Figure, shown: Iterable[NavigationParams]) -> None:
     roles = {area.colour for params in shown for area in ground(params).shapes[1:]}
     areas = [Patch(color=pictures.colour(role), label=role) for role in ORDER if role in roles]
     start = Line2D([], [], linestyle="", label="start", **START)
-    figure.legend(
-        handles=[start, *areas],
-        frameon=False,
-        fontsize=9,
-        loc="outside lower center",
-        ncols=1 + len(areas),
-        handlelength=1.2,
-    )
+    row_below(figure, [start, *areas], fontsize=9, handlelength=1.2)
 
 
 def _outline(axes: Axes, area: Rectangle) -> None:

@@ -8,7 +8,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -56,8 +56,13 @@ def bound(axes: Axes, name: str, level: float, colour: str) -> None:
 
 def legend_below(figure: Figure, axes: Axes) -> None:
     """What `axes` shows, as one row under all panels."""
-    handles, texts = axes.get_legend_handles_labels()
-    figure.legend(handles, texts, frameon=False, fontsize=8, loc="outside lower center", ncols=len(texts))
+    row_below(figure, axes.get_legend_handles_labels()[0])
+
+
+def row_below(figure: Figure, handles: Sequence[Any], **style: Any) -> None:
+    """A legend of `handles`, as one row under all panels."""
+    style = {"fontsize": 8} | style
+    figure.legend(handles=handles, frameon=False, loc="outside lower center", ncols=len(handles), **style)
 
 
 def colour_of(method: str) -> str:
