@@ -24,6 +24,7 @@ from peps_jax.execution.waiting import Reminder
 from peps_jax.reproduce import (
     ablations,
     answers,
+    baselines,
     bias,
     figure1,
     figure2,
@@ -66,6 +67,7 @@ RESULTS: dict[str, Result] = {
     "figure2": figure2,
     "figure3": figure3,
     "table1_many": table1_many,
+    "baselines": baselines,
     "answers": answers,
     "frontier": frontier,
     "teachers": teachers,

@@ -8,9 +8,8 @@ from typing import Any
 
 from peps_jax.config import Config
 from peps_jax.reproduce.plan import Need, Plan
-from peps_jax.reproduce.summary import cells, head, write_texts
+from peps_jax.reproduce.summary import write_table
 from peps_jax.reproduce.variants import lines_of, needs_of
-from peps_jax.storage.tables import csv_bytes, latex, markdown
 
 ABOUT = "PEPS and DRLHP without parts of them"
 
@@ -42,11 +41,4 @@ def needs(plan: Plan) -> list[Need]:
 
 def write(plan: Plan, folder: Path) -> list[Path]:
     """ablations.{md,csv,tex}."""
-    lines = lines_of(plan, variants(plan.base))
-    shown = [cells(made, paper=False) for made in lines]
-    contents = {
-        "ablations.md": markdown(head(paper=False), shown),
-        "ablations.csv": csv_bytes(lines),
-        "ablations.tex": latex(head(paper=False), shown),
-    }
-    return write_texts(folder, contents)
+    return write_table(lines_of(plan, variants(plan.base)), folder, "ablations")

@@ -18,7 +18,7 @@ from peps_jax.analysis.intervals import Estimate, estimate, interquartile_mean, 
 from peps_jax.drawing.panels import save
 from peps_jax.reproduce.store import Record
 from peps_jax.storage import files
-from peps_jax.storage.tables import csv_bytes
+from peps_jax.storage.tables import csv_bytes, latex, markdown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -180,6 +180,18 @@ def write_texts(folder: Path, contents: Mapping[str, str | bytes]) -> list[Path]
     for name, content in contents.items():
         files.write_whole(folder / name, content.encode() if isinstance(content, str) else content)
     return [folder / name for name in contents]
+
+
+def write_table(lines: Sequence[Line], folder: Path, name: str, note: str = "") -> list[Path]:
+    """Writes name.{md,csv,tex}: lines of `line`, and below them what there is to say about them."""
+    names, shown = head(paper=False), [cells(made, paper=False) for made in lines]
+    text = markdown(names, shown)
+    contents = {
+        f"{name}.md": f"{text}\n{note}" if note else text,
+        f"{name}.csv": csv_bytes(lines),
+        f"{name}.tex": latex(names, shown),
+    }
+    return write_texts(folder, contents)
 
 
 def write_picture(picture: Figure, lines: Sequence[Line], folder: Path, name: str) -> list[Path]:

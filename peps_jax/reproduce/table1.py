@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from peps_jax import methods
 from peps_jax.reproduce import ways
@@ -28,16 +27,7 @@ from peps_jax.storage.tables import csv_bytes, latex, markdown
 
 ABOUT = "return and explicability of every method"
 MANY = 10  # times as many answers, in the table after it
-ROWS: dict[str, tuple[str, dict[str, Any]]] = {  # method, and what it is changed in
-    "peps": ("peps", {}),
-    "sac": ("sac", {}),
-    "drlhp": ("drlhp", {}),
-    "policy_shaping": ("policy_shaping", {}),
-    "policy shaping, Gaussians": ("policy_shaping", {"product": "gaussians"}),
-    "oracle": ("oracle", {}),
-    "darc": ("darc", {}),
-    "human_expectation": ("human_expectation", {}),
-}
+ROWS = ("peps", "sac", "drlhp", "policy_shaping", "oracle", "human_expectation")
 # Gong and Zhang 2021, Table 1, in the order of `DOMAINS`: averages over 100 rollouts, without intervals
 PAPER = {
     "return": {
@@ -58,20 +48,21 @@ _NOTE = """\
 bootstrap interval; {episodes} episodes a seed by the policy's mode, "sampled" by its samples. Way: how many seeds go as in the
 paper's Figure 2, and the way of the planner. Paper: Gong and Zhang 2021, Table 1. The planner knows dynamics, belief and rewards;
 "peps" is Eq. (6) at λ = {lam:g}. "human" acts, and is scored, in the MDP that the human believes in. The oracle is told ℓ_H + r_H
-in r̂'s place, and DARC may step the dynamics that the human believes in.
+in r̂'s place.
 """
 
 
 def needs(plan: Plan, many: bool = False) -> list[Need]:
     """All rows in all domains, and the planner's bounds; `many` is the table of `MANY` times as many answers."""
     plans = [plan.planned(domain, objective) for domain in DOMAINS for objective in ("return", "peps", "human")]
-    return plans + [training for domain in DOMAINS for row in ROWS for training in _trainings(plan, domain, row, many)]
+    return plans + [
+        training for domain in DOMAINS for method in ROWS for training in _trainings(plan, domain, method, many)
+    ]
 
 
-def _trainings(plan: Plan, domain: str, row: str, many: bool) -> list[Training]:
-    method, changes = ROWS[row]
+def _trainings(plan: Plan, domain: str, method: str, many: bool) -> list[Training]:
     asked = {"num_queries": plan.base.num_queries * MANY} if many and methods.get(method).asks else {}
-    return plan.trainings(domain, method, **changes, **asked)
+    return plan.trainings(domain, method, **asked)
 
 
 def write(plan: Plan, folder: Path, many: bool = False) -> list[Path]:
@@ -79,7 +70,7 @@ def write(plan: Plan, folder: Path, many: bool = False) -> list[Path]:
 
     With `many`, table1_many and improvement_many.
     """
-    groups = {row: [plan.records(_trainings(plan, domain, row, many)) for domain in DOMAINS] for row in ROWS}
+    groups = {method: [plan.records(_trainings(plan, domain, method, many)) for domain in DOMAINS] for method in ROWS}
     lines = []
     for place, domain in enumerate(DOMAINS):
         for method in ROWS:

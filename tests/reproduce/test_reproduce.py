@@ -301,7 +301,11 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
     texts = {f"{name}.md" for name in ("queries", "frontier", "answers", "bias", "teachers")}
     assert written == texts | {"improvement.csv", "improvement_many.csv", "teachers.csv"} | {
         f"{name}.{kind}" for name in pictures for kind in ("png", "pdf", "csv")
-    } | {f"{name}.{kind}" for name in ("table1", "table1_many", "ablations") for kind in ("md", "csv", "tex")}
+    } | {
+        f"{name}.{kind}"
+        for name in ("table1", "table1_many", "baselines", "ablations")
+        for kind in ("md", "csv", "tex")
+    }
     lines = lines_of(tmp_path / "table1.csv")
     assert len(lines) == len(DOMAINS) * (len(table1.ROWS) + 3) + len(table1.ROWS)
     failing = next(line for line in lines if (line["domain"], line["method"]) == ("nav-d1", "drlhp"))
@@ -309,6 +313,8 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
     assert failing["arrived"] == "2"
     assert "| 2 of 3 |" in (tmp_path / "table1.md").read_text(encoding="utf-8"), "one that failed doesn't arrive"
     assert "200 answers" in (tmp_path / "table1_many.md").read_text(encoding="utf-8")
+    rows = {line["method"] for line in lines_of(tmp_path / "baselines.csv")}
+    assert rows >= {"DARC", "policy shaping, Gaussians", "policy shaping, Gaussians, 200 answers"}
     assert {line["bias"] for line in lines_of(tmp_path / "bias.csv")} == {str(bias_) for bias_ in bias.STRENGTHS}
     assert {line["method"] for line in lines_of(tmp_path / "teachers.csv")} == set(teachers.TEACHERS)
     assert all(line["inflation"] for line in lines_of(tmp_path / "frontier.csv") if line["method"] == "peps")
@@ -327,7 +333,7 @@ def test_everything_is_written_from_what_is_there(tmp_path, capsys, tiny, no_tra
 @pytest.mark.slow
 def test_a_stopped_table_continues(tmp_path, capsys, tiny, monkeypatch):
     monkeypatch.setattr(plan, "PLANNER", {name: dict(points=1, resolution=13) for name in plan.PLANNER})
-    monkeypatch.setattr(table1, "ROWS", {name: (name, {}) for name in ("peps", "sac")})
+    monkeypatch.setattr(table1, "ROWS", ("peps", "sac"))
     monkeypatch.setattr(table1, "BASELINES", ("sac",))
     for module in (table1, figure1):
         monkeypatch.setattr(module, "DOMAINS", ("nav-d1",))
