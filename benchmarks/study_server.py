@@ -27,7 +27,8 @@ import uuid
 from typing import Any
 
 from peps_jax.human_study import settings, tokens
-from peps_jax.human_study.database import Database, Stimulus
+from peps_jax.human_study.database import Database
+from peps_jax.human_study.database.records import Stimulus
 from peps_jax.human_study.settings import Folder
 from peps_jax.storage import files
 

@@ -21,7 +21,8 @@ from peps_envs.registry import unknown_name
 from peps_jax.command_line import Command, Parser, Work, called, number, options
 from peps_jax.human_study import making, tokens, work_commands
 from peps_jax.human_study.action import OUT, Action, Errand
-from peps_jax.human_study.database import ConflictError, Database
+from peps_jax.human_study.database import Database
+from peps_jax.human_study.database.records import ConflictError
 from peps_jax.human_study.server import Study
 from peps_jax.human_study.serving import LOOPBACK, Serving
 from peps_jax.human_study.settings import NUMBERS, PORT, Folder

@@ -10,7 +10,8 @@ import jax
 
 from peps_jax.config import Problem
 from peps_jax.human_study import clips, orders, pairs, settings, tokens
-from peps_jax.human_study.database import AGREEING, Database
+from peps_jax.human_study.database import Database
+from peps_jax.human_study.orders import AGREEING
 from peps_jax.human_study.settings import Folder, Settings
 from peps_jax.preferences.data import Segments
 from peps_jax.storage import code, files

@@ -5,8 +5,9 @@ from __future__ import annotations
 import random
 from collections.abc import Mapping, Sequence
 
-from peps_jax.human_study.database import AGREEING, Place
+from peps_jax.human_study.database.records import Place
 
+AGREEING = 3  # people who see a shared pair
 GAP = 5  # places at least between a pair and its repeat, where there is room
 EARLY = 2 / 3  # of the order, in which pairs stand that are repeated
 

@@ -24,7 +24,7 @@ from peps_envs.navigation import Navigation
 from peps_jax import generator, rollout
 from peps_jax.config import Config, Problem
 from peps_jax.human_study import clips
-from peps_jax.human_study.database import Stimulus
+from peps_jax.human_study.database.records import Stimulus
 from peps_jax.preferences.data import Segments
 from peps_jax.reproduce.driving import comparisons
 from peps_jax.reproduce.driving.scenes import DRY, RAIN, crashed, road, watch, whole

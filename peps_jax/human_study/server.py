@@ -29,11 +29,11 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from peps_jax.human_study import orders, tokens
-from peps_jax.human_study.database import (
+from peps_jax.human_study.database import Database
+from peps_jax.human_study.database.assignments import PATIENCE
+from peps_jax.human_study.database.records import (
     CHOICES,
-    PATIENCE,
     ConflictError,
-    Database,
     Link,
     Next,
     Participant,

@@ -23,7 +23,8 @@ from jax import Array
 from peps_jax import explicability, generator
 from peps_jax.config import Config, Problem
 from peps_jax.human_study import pairs, tokens
-from peps_jax.human_study.database import Database, Stimulus
+from peps_jax.human_study.database import Database
+from peps_jax.human_study.database.records import Stimulus
 from peps_jax.preferences import synthetic_human
 from peps_jax.preferences.data import Queries, Segments
 from peps_jax.reproduce.driving import participants as drivers

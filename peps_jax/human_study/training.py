@@ -25,7 +25,8 @@ from peps_jax.drawing import scenes as drawing
 from peps_jax.execution.devices import compile_over_devices
 from peps_jax.execution.program import shared
 from peps_jax.human_study import pairs, pictures
-from peps_jax.human_study.database import Database, Round, Said
+from peps_jax.human_study.database import Database
+from peps_jax.human_study.database.records import Round, Said
 from peps_jax.human_study.settings import Folder
 from peps_jax.learning import surrogate
 from peps_jax.preferences import data, teachers

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from peps_jax.human_study import settings, tokens
-from peps_jax.human_study.database import Database, Stimulus, Watching
+from peps_jax.human_study.database import Database
+from peps_jax.human_study.database.records import Stimulus, Watching
 from peps_jax.human_study.server import Study
 from peps_jax.human_study.serving import Serving
 from peps_jax.human_study.settings import Folder

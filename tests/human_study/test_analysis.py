@@ -10,7 +10,8 @@ import pytest
 from scipy import stats
 
 from peps_jax.human_study import analysis, making, orders, pairs, statistics
-from peps_jax.human_study.database import Database, Watching
+from peps_jax.human_study.database import Database
+from peps_jax.human_study.database.records import Watching
 from peps_jax.human_study.settings import Folder
 from peps_jax.storage.arrays import write_arrays
 

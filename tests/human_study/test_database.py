@@ -9,7 +9,8 @@ import pytest
 from study_cases import WATCHED, stimuli, stimulus
 
 from peps_jax.human_study import orders, tokens
-from peps_jax.human_study.database import ConflictError, Database, Link, Place, Recruit, Wait
+from peps_jax.human_study.database import Database
+from peps_jax.human_study.database.records import ConflictError, Link, Place, Recruit, Wait
 
 FRAMES = (30, 30)
 LEASE = 120.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from peps_jax.human_study import pairs
-from peps_jax.human_study.database import Stimulus
+from peps_jax.human_study.database.records import Stimulus
 from peps_jax.reproduce.driving.scenes import crashed
 
 

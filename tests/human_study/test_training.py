@@ -9,7 +9,8 @@ import pytest
 from peps_envs.navigation import Navigation
 from peps_jax import train
 from peps_jax.human_study import pairs, training
-from peps_jax.human_study.database import Database, Place, Wait, Watching
+from peps_jax.human_study.database import Database
+from peps_jax.human_study.database.records import Place, Wait, Watching
 from peps_jax.human_study.settings import Folder, template
 from peps_jax.preferences import data, teachers
 from peps_jax.preferences.data import Answers

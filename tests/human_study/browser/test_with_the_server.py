@@ -13,7 +13,8 @@ import study_cases
 from study_cases import Client, invite, make_study, served
 
 from browser.fake import VIEW, clicking, clip
-from peps_jax.human_study.database import Database, Stimulus
+from peps_jax.human_study.database import Database
+from peps_jax.human_study.database.records import Stimulus
 from peps_jax.storage import files
 
 expect = pytest.importorskip("playwright.sync_api", reason="Playwright isn't installed").expect
