@@ -5,7 +5,7 @@
 
 import os
 
-from compiler import QUICKLY
+from compiler import QUICKLY, keep_what_is_compiled
 
 # before JAX starts
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2 {QUICKLY}"
@@ -33,6 +33,7 @@ from peps_jax.settings import Settings
 from peps_jax.train import init, prepare
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+keep_what_is_compiled()
 
 gc.set_threshold(100_000, 20, 50)  # tracing makes many objects, and hardly any garbage that refers to itself
 

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 from conftest import Line, LineParams
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 import peps_envs
 from peps_jax import methods
@@ -21,7 +22,12 @@ EPISODES = 2
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     monkeypatch.setenv(compilation_cache.VARIABLE, str(tmp_path / "kept"))
-    return tmp_path / "kept"
+    tests_own = jax.config.jax_compilation_cache_dir  # what JAX has isn't kept once more
+    jax.config.update("jax_compilation_cache_dir", None)
+    reset_cache()
+    yield tmp_path / "kept"
+    jax.config.update("jax_compilation_cache_dir", tests_own)
+    reset_cache()
 
 
 def kept(about, make):
