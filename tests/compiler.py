@@ -11,7 +11,7 @@ MOST = 10**9  # bytes
 
 
 def keep_what_is_compiled() -> None:
-    """For the workers beside this one, and for the next time, which takes half as long.
+    """For the workers beside this one, and for the next time, which takes two thirds as long.
 
     JAX knows a program by what it consists of, so that changed code is compiled anew. Only pytest's own processes keep something
     here: others are killed by tests, and might leave half of it.
