@@ -46,7 +46,7 @@ def seconds_of(folder: Path, needs: Iterable[Need]) -> dict[str, float] | None:
 def table(folder: Path) -> str:
     """A row for each result that is complete in the folder, in the order of the command's help."""
     head = json.loads((folder / HEAD).read_text(encoding="utf-8"))
-    plan, before, rows = Plan(Config(), head["seeds"], 100), set(), []
+    plan, before, rows = Plan(Config(), head["seeds"], head["settings"]["episodes"]), set(), []
     for name, result in RESULTS.items():
         parts = seconds_of(folder, result.needs(plan))
         if parts is None:
@@ -56,14 +56,16 @@ def table(folder: Path) -> str:
         minutes = (f"{sum(some.values()) / 60:.0f}" for some in (parts, new))
         rows.append([f"`{name}`", str(len(parts)), *minutes])
     shown = markdown(["result", "trainings and plans", "minutes by itself", "after those above"], rows)
-    note = "a quarter of a minute of compilation for each method comes on top"
-    return f"{shown}\nWith `--seeds {head['seeds']}` on {len(head['devices'])} cores; {note}.\n"
+    return f"{shown}\nWith `--seeds {head['seeds']}` on {len(head['devices'])} cores; each method's compilation comes on top.\n"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path, help="of `python -m peps_jax.reproduce --out`")
-    text = table(parser.parse_args().folder)
+    folder = parser.parse_args().folder
+    if not (folder / HEAD).is_file():
+        parser.error(f"folder {str(folder)!r} holds no reproduction ({HEAD})")
+    text = table(folder)
     files.write_whole(OUT, text.encode())
     print(text)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from peps_jax.config import Config
 from peps_jax.reproduce.plan import Need, Plan
 from peps_jax.reproduce.summary import write_table
 from peps_jax.reproduce.table1 import MANY
@@ -16,9 +17,9 @@ step the dynamics that the human believes in, and asks nothing.
 """
 
 
-def variants(plan: Plan) -> Variants:
+def variants(base: Config) -> Variants:
     """Rows of Table 1, and what goes beside them."""
-    many = plan.base.num_queries * MANY
+    many = base.num_queries * MANY
     gaussians = {"product": "gaussians"}
     return {
         "PEPS": ("peps", {}),
@@ -33,10 +34,10 @@ def variants(plan: Plan) -> Variants:
 
 def needs(plan: Plan) -> list[Need]:
     """Every row in every domain, with all seeds."""
-    return needs_of(plan, variants(plan), seeds=None)
+    return needs_of(plan, variants(plan.base), seeds=None)
 
 
 def write(plan: Plan, folder: Path) -> list[Path]:
     """baselines.{md,csv,tex}."""
-    lines = lines_of(plan, variants(plan), seeds=None)
+    lines = lines_of(plan, variants(plan.base), seeds=None)
     return write_table(lines, folder, "baselines", _NOTE.format(answers=plan.base.num_queries))
