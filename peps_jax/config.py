@@ -66,6 +66,7 @@ class Lengths:
 
     num_rounds: Any  # () int32
     warmup_rounds: Any  # () int32, whose actions are all random
+    unasked_rounds: Any  # () int32, before the first query
     num_queries: Any  # () int32, asked in all
 
 
@@ -184,6 +185,9 @@ class Config:
     )
 
     num_queries: int = static(300, COUNT_OR_NONE, "queries that the teacher is asked in all", group="queries")
+    unasked_steps: int = static(
+        0, COUNT_OR_NONE, "environment steps at the start, before the first query", group="queries"
+    )
     segment_length: int = static(5, COUNT, "steps of the longest segment", group="queries")
     min_segment_length: int = static(
         2, COUNT, "steps of the shortest segment (unequal lengths pin the level)", group="queries"
@@ -252,14 +256,20 @@ class Config:
         return -(-self.warmup_steps // self.steps_per_round)
 
     @property
+    def unasked_rounds(self) -> int:
+        """Rounds before the first query."""
+        return -(-self.unasked_steps // self.steps_per_round)
+
+    @property
     def updates_per_round(self) -> int:
         """SAC updates in a round."""
         return max(1, round(self.steps_per_round * self.updates_per_step))
 
     @property
     def queries_per_round(self) -> int:
-        """Queries asked in each round until all are asked; there is room for one if nothing is asked."""
-        return capacity(max(1, -(-self.num_queries // self.num_rounds)))
+        """Queries asked in each round from the first one on until all are asked; there is room for one if nothing is asked."""
+        asking_rounds = max(1, self.num_rounds - self.unasked_rounds)
+        return capacity(max(1, -(-self.num_queries // asking_rounds)))
 
     @property
     def room(self) -> int:
@@ -269,13 +279,14 @@ class Config:
     @property
     def length_values(self) -> Lengths:
         """`lengths`, or what the sizes say."""
-        return self.lengths or Lengths(self.num_rounds, self.warmup_rounds, self.num_queries)
+        return self.lengths or Lengths(self.num_rounds, self.warmup_rounds, self.unasked_rounds, self.num_queries)
 
     def with_room(self) -> Config:
         """The same training, equal in everything static to others of other lengths that fit into the same room."""
         return self.replace(
             total_steps=self.room * self.steps_per_round,
             warmup_steps=0,
+            unasked_steps=0,
             num_queries=self.room * self.queries_per_round,
             lengths=jax.tree.map(np.int32, self.length_values),
         )
@@ -290,6 +301,11 @@ class Config:
             if field.metadata.get("pytree_node", True):
                 check_single(field, getattr(self, field.name))
         _check_problem(self.problem())
+        if self.num_queries and self.unasked_rounds >= self.num_rounds:
+            raise ValueError(
+                f"unasked_steps {self.unasked_steps} leaves no round to ask in: a training has {self.num_rounds} rounds of "
+                f"{self.steps_per_round} steps; choose at most {(self.num_rounds - 1) * self.steps_per_round}"
+            )
         _check_lengths(self)
         if self.num_envs % self.watched_every:
             raise ValueError(
@@ -326,12 +342,14 @@ def _check_problem(problem: Problem) -> None:
 
 def _check_lengths(config: Config) -> None:
     """Raises ValueError if there is no room for so many rounds or queries. Traced values are not looked at."""
-    room = {"num_rounds": config.num_rounds, "num_queries": config.num_rounds * config.queries_per_round}
+    lengths = config.length_values
+    if any(isinstance(value, jax.core.Tracer) for value in jax.tree.leaves(lengths)):
+        return
+    asking_rounds = config.num_rounds - int(np.max(lengths.unasked_rounds))
+    room = {"num_rounds": config.num_rounds, "num_queries": asking_rounds * config.queries_per_round}
     for name, most in room.items():
-        value = getattr(config.length_values, name)
-        if not isinstance(value, jax.core.Tracer) and not np.all(
-            (np.asarray(value) >= 0) & (np.asarray(value) <= most)
-        ):
+        value = getattr(lengths, name)
+        if not np.all((np.asarray(value) >= 0) & (np.asarray(value) <= most)):
             raise ValueError(f"lengths have {name} {shown(value)}: there is room for {most}; choose at most that")
 
 

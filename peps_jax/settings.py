@@ -130,6 +130,7 @@ class QuerySettings:
 
     per_round: int = _static()
     room: int = _static()  # places that all rounds' queries take
+    unasked_rounds: Array = _whole()  # before the first query
     budget: Array = _whole()  # in all; the last round may have fewer than others
     segment_length: int = _static()  # steps
     min_segment_length: int = _static()
@@ -200,6 +201,7 @@ def settings_of(config: Config, problem: Problem) -> Settings:
             config,
             per_round=config.queries_per_round,
             room=config.room * config.queries_per_round,
+            unasked_rounds=lengths.unasked_rounds,
             budget=lengths.num_queries,
             strategy=config.query_strategy,
         ),

@@ -168,7 +168,8 @@ def collect_and_ask(
     if not method.asks:
         return state, None, info
     segments = method.ask(state.knowledge, trajectory, now.keys.ask, settings)
-    preferences, queries = data.ask(state.preferences, segments, now.index, settings.queries.room, state.budget)
+    when = now.index, settings.queries.unasked_rounds
+    preferences, queries = data.ask(state.preferences, segments, *when, settings.queries.room, state.budget)
     return state.replace(preferences=preferences), queries, info
 
 

@@ -30,6 +30,7 @@ WRONG = [
     ("uniform_answers", 1.0, "from 0 to below 1"),
     ("critic_normalisation", 1, "True or False"),
     ("warmup_steps", -5, "a whole number from 0 to"),
+    ("unasked_steps", 121, "120"),
     ("updates_per_step", 0.0, "above 0"),
     ("hidden_sizes", (), "whole numbers from 1 to"),
     ("hidden_sizes", (8, 0), "whole numbers from 1 to"),
@@ -193,10 +194,11 @@ def test_grid_says_what_is_wrong(line, leaves, message):
 
 
 def test_lengths_have_to_fit_in():
-    config = Config(total_steps=4_000, num_queries=20).with_room()
+    config = Config(total_steps=4_000, unasked_steps=2_000, num_queries=20).with_room()
     config.check()
-    assert (config.total_steps, config.num_queries) == (4_000, 20)
-    assert jax.tree.map(int, config.lengths) == Lengths(num_rounds=10, warmup_rounds=12, num_queries=20)
+    assert (config.total_steps, config.queries_per_round, config.num_queries) == (4_000, 4, 40)
+    lengths = Lengths(num_rounds=10, warmup_rounds=12, unasked_rounds=5, num_queries=20)
+    assert jax.tree.map(int, config.lengths) == lengths
     with pytest.raises(ValueError, match="lengths have num_rounds 11: there is room for 10; choose at most that"):
         config.replace(lengths=config.lengths.replace(num_rounds=11)).check()
     with pytest.raises(ValueError, match="lengths have num_queries 21: there is room for 20"):

@@ -9,6 +9,7 @@ from conftest import Line, LineParams
 
 import peps_jax
 from peps_jax import generator, grid
+from peps_jax.preferences import data
 from peps_jax.preferences.data import Answers
 from peps_jax.preferences.teachers import Teacher
 from peps_jax.round import annealed_temperature, round_at
@@ -201,6 +202,18 @@ def further_right(key, queries, problem, settings):
     last = jnp.take_along_axis(segments.next_state.place[..., 0], end, -1)[..., 0]
     preferred = (last[:, 0] > last[:, 1]).astype(jnp.float32)
     return Answers(queries.number, preferred, jnp.arange(preferred.size) % 2.0)
+
+
+def test_queries_begin_when_they_are_said_to(line, train):
+    config = line.replace(unasked_steps=2 * line.steps_per_round)
+    result = train(config)
+    by_round = result.preferences.number.reshape(line.num_rounds, config.queries_per_round)
+    assert config.queries_per_round == 10
+    np.testing.assert_array_equal(by_round[:2], data.NOBODY)
+    np.testing.assert_array_equal(by_round[2:].ravel(), np.arange(20))
+    np.testing.assert_array_equal(result.preferences.weight, np.repeat([0, 1], 20))
+    untaught = result.curves["surrogate_loss"][:2]
+    np.testing.assert_array_equal(untaught, 0)
 
 
 def test_anybody_is_a_teacher(line, train):

@@ -86,22 +86,23 @@ def empty(capacity: int, steps: int, observation_size: int, action_space: Action
 
 
 def ask(
-    preferences: PreferenceSet, segments: Segments, index: Array, room: int, budget: Array
+    preferences: PreferenceSet, segments: Segments, index: Array, unasked: Array, room: int, budget: Array
 ) -> tuple[PreferenceSet, Queries]:
     """Writes the pairs that are asked in round `index` (from 0), gives them numbers, and returns both.
 
-    What was recorded before the training stands in front of them and has lower numbers. What is asked beyond the budget has no
-    number, isn't written, and no answer to it is filed.
+    What was recorded before the training stands in front of them and has lower numbers. What would be asked in the first `unasked`
+    rounds or beyond the budget has no number, isn't written, and no answer to it is filed.
 
     Args:
+      unasked: rounds before the first query.
       room: places at the set's end for what is asked in the training.
       budget: queries that are asked in all.
     """
     per_round = segments.mask.shape[0]
-    asked = jnp.arange(per_round, dtype=jnp.int32) + index * per_round
+    asked = jnp.arange(per_round, dtype=jnp.int32) + (index - unasked) * per_round
     recorded = preferences.number.shape[0] - room
     first = jnp.max(preferences.number[:recorded], initial=NOBODY) + 1
-    number = jnp.where(asked < budget, first + asked, NOBODY)
+    number = jnp.where((asked >= 0) & (asked < budget), first + asked, NOBODY)
     segments = segments._replace(mask=segments.mask.astype(bool))
     shown = _padded(segments, preferences.mask.shape[-1])
     nothing = jnp.zeros(per_round, jnp.float32)

@@ -24,18 +24,18 @@ def pairs(number, first=0.0, steps=STEPS):
 
 
 @functools.partial(jax.jit, static_argnames="room")
-def ask(preferences, segments, index, room=12, budget=10):
-    return data.ask(preferences, segments, index, room, jnp.asarray(budget))
+def ask(preferences, segments, index, unasked=0, room=12, budget=10):
+    return data.ask(preferences, segments, index, unasked, room, jnp.asarray(budget))
 
 
-def asked(rounds=3, recorded=None):
+def asked(rounds=3, recorded=None, unasked=0):
     """A set after so many rounds of four queries, ten in all, and the queries of each."""
     preferences = data.empty(12, STEPS, 1, Box(1))
     if recorded is not None:
         preferences = data.joined(recorded, preferences)
     queries = []
     for index in range(rounds):
-        preferences, now = ask(preferences, pairs(4, 4.0 * index), jnp.asarray(index))
+        preferences, now = ask(preferences, pairs(4, 4.0 * index), jnp.asarray(index), jnp.asarray(unasked))
         queries.append(now)
     return preferences, queries
 
@@ -58,6 +58,15 @@ def test_queries_have_numbers_and_what_is_beyond_the_budget_has_none():
     np.testing.assert_array_equal(queries[2].number, [8, 9, data.NOBODY, data.NOBODY])
     np.testing.assert_array_equal(preferences.observation[:, 0, 0, 0], [*range(10), 0, 0])
     assert not np.any(preferences.weight)
+
+
+def test_what_is_asked_begins_after_the_rounds_without_queries():
+    preferences, queries = asked(unasked=1)
+    assert [now.number.tolist() for now in queries] == [[data.NOBODY] * 4, [0, 1, 2, 3], [4, 5, 6, 7]]
+    np.testing.assert_array_equal(preferences.number, [*[data.NOBODY] * 4, *range(8)])
+    np.testing.assert_array_equal(preferences.observation[:, 0, 0, 0], [0, 0, 0, 0, *range(4, 12)])
+    found = filed(preferences, said([data.NOBODY, 0, 5], [1.0, 1.0, 1.0]))
+    np.testing.assert_array_equal(np.flatnonzero(found.weight), [4, 9])
 
 
 def test_where_nothing_may_be_asked_a_recording_stays_as_it_is():
@@ -98,7 +107,7 @@ def test_under_vmap_a_write_is_one_slice():
     """At a batched place it would be a scatter of rows. JAX writes a slice as a scatter too, of one window of all dimensions."""
 
     def program(preferences, segments, number):
-        preferences, queries = data.ask(preferences, segments, jnp.asarray(1), 12, jnp.asarray(10))
+        preferences, queries = data.ask(preferences, segments, jnp.asarray(1), jnp.asarray(0), 12, jnp.asarray(10))
         answers = Answers(queries.number + number, jnp.ones(4), jnp.ones(4))
         return data.known(data.file(preferences, answers, jnp.asarray(1)), jnp.asarray(2))
 
