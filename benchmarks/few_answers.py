@@ -29,7 +29,8 @@ from peps_jax.storage.tables import markdown
 
 RESULTS = Path(__file__).parent / "results"
 OUT = RESULTS / "few_answers.md"
-ANSWERS, EPISODES, FIRST_SEED = 100, 100, 100
+ANSWERS, MORE = 100, Config().num_queries
+EPISODES, FIRST_SEED = 100, 100
 DEFAULTS = "the defaults"
 
 
@@ -50,6 +51,8 @@ def changes() -> dict[str, dict[str, Any]]:
         "twice as many steps on r̂": {"surrogate_updates": 2 * base.surrogate_updates},
         "weight decay 0.01": {"surrogate_decay": 1e-2},
         "λ = 1.2": {"lam": 1.2},
+        f"{MORE} answers": {"num_queries": MORE},
+        f"{MORE} answers, none asked while actions are random": late | {"num_queries": MORE},
         "the oracle, which asks nothing": {"method": "oracle"},
     }
 
@@ -66,7 +69,7 @@ def targets() -> dict[str, float]:
 
 
 _NOTE = f"""\
-{ANSWERS} answers, {{seeds}} seeds from {FIRST_SEED} on, {EPISODES} episodes each by the policy's mode. Explicability: interquartile
+{ANSWERS} answers where no other number is given, {{seeds}} seeds from {FIRST_SEED} on, {EPISODES} episodes each by the policy's mode. Explicability: interquartile
 means over seeds, and how many seeds reach what the head says, {REACHED:.0%} of the way from SAC's explicability to the
 planner's. More: than the defaults with the same seeds, mean over domains and seeds and its standard error.
 """
