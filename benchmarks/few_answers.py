@@ -69,7 +69,7 @@ def targets() -> dict[str, float]:
 
 
 _NOTE = f"""\
-{ANSWERS} answers where no other number is given, {{seeds}} seeds from {FIRST_SEED} on, {EPISODES} episodes each by the policy's mode.
+{ANSWERS} answers where no other number is given, {{seeds}} seeds from {FIRST_SEED} on, {EPISODES} episodes each.
 Explicability: interquartile means over seeds, and how many seeds reach what the head says, {REACHED:.0%} of the way from SAC's
 explicability to the planner's. More: than the defaults with the same seeds, mean over domains and seeds and its standard error.
 """
