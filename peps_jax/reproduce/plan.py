@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -238,8 +239,12 @@ class Plan:
 
         def keep_batch(done: batches.Batch, finished: Sequence[FinishedRun], times: Times) -> None:
             seconds = (times.run + times.evaluate) / len(done.runs)
-            for place, run in zip(done.runs, finished, strict=True):
-                keep(trainings[place], _reduce(run, self.num_episodes, seconds, trainings[place].view))
+            own = [trainings[place] for place in done.runs]
+            reduced = lambda training, run: _reduce(run, self.num_episodes, seconds, training.view)
+            with ThreadPoolExecutor(len(done.devices)) as pool:  # whose cores have nothing else to do
+                records = list(pool.map(reduced, own, finished))
+            for training, record in zip(own, records, strict=True):
+                keep(training, record)
 
         if trainings:
             configs = [training.config for training in trainings]
