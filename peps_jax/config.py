@@ -248,17 +248,20 @@ class Config:
     @property
     def num_rounds(self) -> int:
         """Rounds in a training; the last one may go past `total_steps`."""
-        return -(-self.total_steps // self.steps_per_round)
+        return self._rounds(self.total_steps)
 
     @property
     def warmup_rounds(self) -> int:
         """Rounds whose actions are all random."""
-        return -(-self.warmup_steps // self.steps_per_round)
+        return self._rounds(self.warmup_steps)
 
     @property
     def unasked_rounds(self) -> int:
         """Rounds before the first query."""
-        return -(-self.unasked_steps // self.steps_per_round)
+        return self._rounds(self.unasked_steps)
+
+    def _rounds(self, steps: int) -> int:
+        return -(-steps // self.steps_per_round)
 
     @property
     def updates_per_round(self) -> int:
@@ -342,14 +345,14 @@ def _check_problem(problem: Problem) -> None:
 
 def _check_lengths(config: Config) -> None:
     """Raises ValueError if there is no room for so many rounds or queries. Traced values are not looked at."""
+    known = lambda value: not isinstance(value, jax.core.Tracer)
     lengths = config.length_values
-    if any(isinstance(value, jax.core.Tracer) for value in jax.tree.leaves(lengths)):
-        return
-    asking_rounds = config.num_rounds - int(np.max(lengths.unasked_rounds))
+    unasked = int(np.max(lengths.unasked_rounds)) if known(lengths.unasked_rounds) else 0
+    asking_rounds = max(0, config.num_rounds - unasked)
     room = {"num_rounds": config.num_rounds, "num_queries": asking_rounds * config.queries_per_round}
     for name, most in room.items():
         value = getattr(lengths, name)
-        if not np.all((np.asarray(value) >= 0) & (np.asarray(value) <= most)):
+        if known(value) and not np.all((np.asarray(value) >= 0) & (np.asarray(value) <= most)):
             raise ValueError(f"lengths have {name} {shown(value)}: there is room for {most}; choose at most that")
 
 

@@ -205,6 +205,10 @@ def test_lengths_have_to_fit_in():
         config.replace(lengths=config.lengths.replace(num_queries=21)).check()
 
 
+def test_a_training_that_asks_nothing_needs_no_round_to_ask_in():
+    Config(total_steps=4_000, unasked_steps=8_000, num_queries=0).check()
+
+
 def test_room_is_a_round_number():
     assert [capacity(number) for number in (1, 5, 6, 7, 11, 50, 51, 99, 150, 151, 1_234, 10_001)] == [
         1, 5, 6, 8, 12, 50, 60, 100, 150, 200, 1_500, 12_000,
