@@ -9,26 +9,27 @@ here, and tables and figures show others.
 from __future__ import annotations
 
 import argparse
-import csv
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import readme
 
 from peps_jax import Config
 from peps_jax.analysis.intervals import interquartile_mean
 from peps_jax.command_line import use_every_core
 from peps_jax.config import Lengths
 from peps_jax.execution import batches
-from peps_jax.reproduce.queries import QUERY_DOMAINS, REACHED
+from peps_jax.execution.program import FinishedRun, Times
+from peps_jax.execution.progress import Display
+from peps_jax.reproduce.queries import QUERY_DOMAINS, REACHED, to_reach
 from peps_jax.reproduce.summary import title
 from peps_jax.storage import files
 from peps_jax.storage.tables import markdown
 
-RESULTS = Path(__file__).parent / "results"
-OUT = RESULTS / "few_answers.md"
+OUT = Path(__file__).parent / "results" / "few_answers.md"
 ANSWERS, MORE = 100, Config().num_queries
 EPISODES, FIRST_SEED = 100, 100
 DEFAULTS = "the defaults"
@@ -59,13 +60,12 @@ def changes() -> dict[str, dict[str, Any]]:
 
 def targets() -> dict[str, float]:
     """The explicability to reach in each domain, from Table 1 as it is published."""
-    with open(RESULTS / "table1.csv", encoding="utf-8", newline="") as table:
-        rows = {(row["domain"], row["method"]): row for row in csv.DictReader(table)}
-    ends = {}
-    for domain in QUERY_DOMAINS:  # a plan is no sample: it has no interquartile mean
-        sac, planner = rows[domain, "sac"]["explicability"], rows[domain, "planner, peps"]["explicability_mean"]
-        ends[domain] = float(sac) + REACHED * (float(planner) - float(sac))
-    return ends
+    rows = readme.published("benchmarks/results/table1.csv")
+    sac = lambda domain: float(rows[domain, "sac"]["explicability"])
+    planner = lambda domain: float(
+        rows[domain, readme.BEST]["explicability_mean"]
+    )  # a plan is no sample, and has no IQM
+    return {domain: to_reach(sac(domain), planner(domain)) for domain in QUERY_DOMAINS}
 
 
 _NOTE = f"""\
@@ -75,30 +75,32 @@ explicability to the planner's. More: than the defaults with the same seeds, mea
 """
 
 
-class _Scores(batches.Watch):
-    """(runs,) explicability, and whether the mode arrives."""
+class Scores(NamedTuple):
+    """Of the trainings of one change, (trainings,) each."""
 
-    def __init__(self, runs: int):
-        self.explicability, self.arrived = np.zeros(runs), np.zeros(runs, bool)
-
-    def finished(self, batch: batches.Batch, runs: Any, times: Any) -> None:
-        for place, run in zip(batch.runs, runs, strict=True):
-            self.explicability[place] = np.mean(run.evaluation.explicability)
-            self.arrived[place] = np.mean(run.evaluation.goal_reached) > 0.5
+    explicability: np.ndarray
+    arrived: np.ndarray  # bool, whether the mode does
 
 
-def scores(changed: Mapping[str, Any], seeds: int) -> _Scores:
+def scores(changed: Mapping[str, Any], seeds: int) -> Scores:
     """Of every domain's seeds, one domain after the other."""
     config = Config(**({"num_queries": ANSWERS} | changed))
     over_seeds = range(FIRST_SEED, FIRST_SEED + seeds)
     configs = [config.replace(env=domain, seed=seed) for domain in QUERY_DOMAINS for seed in over_seeds]
-    found = _Scores(len(configs))
+    found = Scores(np.zeros(len(configs)), np.zeros(len(configs), bool))
+
+    def keep(batch: batches.Batch, runs: Sequence[FinishedRun], times: Times) -> None:
+        for place, run in zip(batch.runs, runs, strict=True):
+            found.explicability[place] = np.mean(run.evaluation.explicability)
+            found.arrived[place] = np.mean(run.evaluation.goal_reached) > 0.5
+
     divided = batches.plan(configs, EPISODES, most=batches.runs_soon_done(jax.devices()))
-    batches.run(configs, divided, EPISODES, found)
+    with Display(configs, divided, keep) as display:
+        batches.run(configs, divided, EPISODES, display)
     return found
 
 
-def row(name: str, found: _Scores, before: _Scores, target: Mapping[str, float]) -> list[str]:
+def row(name: str, found: Scores, before: Scores, target: Mapping[str, float]) -> list[str]:
     """A line of the table."""
     by_domain = found.explicability.reshape(len(target), -1)
     levels = interquartile_mean(by_domain[..., None])

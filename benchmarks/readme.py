@@ -47,10 +47,15 @@ def measured(file: str, page: Path) -> str:
     return re.sub(r"\]\((?=[^)/]+\.(?:png|gif)\))", f"]({folder}/", (ROOT / file).read_text(encoding="utf-8"))
 
 
+def published(file: str) -> dict[tuple[str, str], dict[str, str]]:
+    """The lines of `file`, a table1.csv, by domain and method."""
+    with open(ROOT / file, encoding="utf-8", newline="") as table_:
+        return {(row["domain"], row["method"]): row for row in csv.DictReader(table_)}
+
+
 def headline(file: str) -> str:
     """How many seeds of PEPS, SAC and DRLHP arrive in each domain, scores with intervals, and the planner's explicability."""
-    with open(ROOT / file, encoding="utf-8", newline="") as table_:
-        rows = {(row["domain"], row["method"]): row for row in csv.DictReader(table_)}
+    rows = published(file)
     domains = [domain for domain, method in rows if method == BEST]
 
     def estimate(domain: str, method: str, score: str) -> str:

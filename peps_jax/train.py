@@ -168,8 +168,8 @@ def collect_and_ask(
     if not method.asks:
         return state, None, info
     segments = method.ask(state.knowledge, trajectory, now.keys.ask, settings)
-    when = now.index, settings.queries.unasked_rounds
-    preferences, queries = data.ask(state.preferences, segments, *when, settings.queries.room, state.budget)
+    unasked, room = settings.queries.unasked_rounds, settings.queries.room
+    preferences, queries = data.ask(state.preferences, segments, now.index, unasked, room, state.budget)
     return state.replace(preferences=preferences), queries, info
 
 

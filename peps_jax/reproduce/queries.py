@@ -88,6 +88,11 @@ def write(plan: Plan, folder: Path) -> list[Path]:
     return [*write_picture(figure, lines, folder, "queries"), *write_texts(folder, {"queries.md": _table(lines)})]
 
 
+def to_reach(sac: float, planner: float) -> float:
+    """The explicability at `REACHED` of the way from one to the other."""
+    return sac + REACHED * (planner - sac)
+
+
 def queries_needed(budgets: Sequence[int], values: Sequence[float], target: float) -> float:
     """Where the line through `values` over the logarithm of `budgets` first reaches `target`; inf if it doesn't."""
     above = np.flatnonzero(np.asarray(values) >= target)
@@ -105,7 +110,7 @@ def _table(lines: Sequence[Line]) -> str:
     for domain in QUERY_DOMAINS:
         own = [line for line in lines if line["domain"] == domain]
         level = {line["strategy"]: line["explicability"] for line in own if "queries" not in line}
-        target = level["SAC"] + REACHED * (level["planner"] - level["SAC"])
+        target = to_reach(level["SAC"], level["planner"])
         for strategy in STRATEGIES:
             points = [line for line in own if line["strategy"] == strategy]
             needed = queries_needed(budgets, [point["explicability"] for point in points], target)
