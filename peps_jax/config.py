@@ -100,6 +100,9 @@ class Config:
         1.0, NOT_NEGATIVE, "weight of the environment entropy in Eq. (6)", group="objective"
     )
     policy_entropy_weight: Any = traced(0.3, NOT_NEGATIVE, "weight of the policy entropy in Eq. (6)", group="objective")
+    entropy_fade_share: Any = traced(
+        0.1, SHARE, "share of the rounds, at the end, over which that weight falls to a tenth", group="objective"
+    )
     entropies: str = static(
         "relative",
         ENTROPIES,

@@ -31,6 +31,7 @@ class Round(NamedTuple):
     filled: Array  # () int32, transitions in replay when this round's are there
     temperature: Array  # () SAC's own, in reward units
     learning_rate: Array  # () SAC's
+    policy_entropy: Array  # () share of Eq. (6)'s weight of the policy entropy
 
 
 def round_at(index: Array, key: Array, schedule: ScheduleSettings) -> Round:
@@ -43,7 +44,10 @@ def round_at(index: Array, key: Array, schedule: ScheduleSettings) -> Round:
         position=position,
         filled=position + schedule.steps_per_round,
         temperature=annealed_temperature(index, schedule),
-        learning_rate=faded_learning_rate(index, schedule),
+        # late in a training a full step trades one of two nearly equal ways for the other
+        learning_rate=(schedule.learning_rate * faded(index, schedule.fade_share, schedule)).astype(jnp.float32),
+        # what the objective pays for noise serves learning; whoever acts by samples in the end pays for it
+        policy_entropy=faded(index, schedule.entropy_fade_share, schedule).astype(jnp.float32),
     )
 
 
@@ -54,11 +58,7 @@ def annealed_temperature(index: Array, schedule: ScheduleSettings) -> Array:
     return jnp.exp((1 - done) * jnp.log(first) + done * jnp.log(last)).astype(jnp.float32)
 
 
-def faded_learning_rate(index: Array, schedule: ScheduleSettings) -> Array:
-    """Whole at first, then falling linearly to a tenth at the end.
-
-    Late in a training a full step trades one of two nearly equal ways for the other.
-    """
+def faded(index: Array, over: Array, schedule: ScheduleSettings) -> Array:
+    """1 at first, then falling linearly to a tenth over the last `over` (a share) of the rounds."""
     left = 1 - index / schedule.num_rounds
-    share = jnp.clip(left / jnp.maximum(schedule.fade_share, 1e-6), 0.1, 1.0)
-    return (schedule.learning_rate * share).astype(jnp.float32)
+    return jnp.clip(left / jnp.maximum(over, 1e-6), 0.1, 1.0)

@@ -43,6 +43,7 @@ class ScheduleSettings:
     warmup_rounds: Array = _whole()
     learning_rate: Array
     fade_share: Array
+    entropy_fade_share: Array
     initial_temperature: Array
     temperature: Array
     anneal_share: Array

@@ -195,7 +195,8 @@ def improve(state: TrainingState, now: Round, training: Training) -> tuple[tuple
     shape = (settings.agent.updates, settings.agent.batch_size)
     index = replay.draw(key_batch, shape, now.filled)
     batches = replay.rows(state.replay, index)
-    temperature = (now.temperature + method.entropy_weight(settings)) * settings.agent.reward_scale
+    paid = now.policy_entropy * method.entropy_weight(settings)
+    temperature = (now.temperature + paid) * settings.agent.reward_scale
     current = settings.agent.replace(learning_rate=now.learning_rate)
     keys = sac.agent_keys(key_update, len(method.rewards))
 

@@ -36,7 +36,7 @@ SETTINGS = dict(
     surrogate_learning_rate=5e-3, surrogate_updates=3, surrogate_batch_size=8, surrogate_decay=1e-4, num_queries=18,
     segment_length=5, min_segment_length=2, query_strategy="information_gain", candidates_per_query=10, gamma=0.995,
     policy_entropy_weight=0.3, mistake_rate=0.1, myopia=0.95, prior="observed", bound=1.0, uniform_answers=0.0,
-    critic_normalisation=True, product="gaussians", informed=0.0,
+    critic_normalisation=True, product="gaussians", informed=0.0, entropy_fade_share=0.0,
 )  # fmt: skip
 SWEEP = """
     --env nav-d1 --method peps sac --lam 0.5 2.0 --seeds 2 --seed 3 --total-steps 120 --num-envs 4 --rollout-length 10

@@ -311,6 +311,25 @@ def test_the_temperature_fades_geometrically(line):
     assert at(9) == pytest.approx(1.0)
 
 
+def test_eq_6s_policy_entropy_falls_to_a_tenth_at_the_end(line, train):
+    """SAC's own temperature, which is constant here, stays."""
+    config = line.replace(
+        initial_temperature=1.0,
+        temperature=1.0,
+        lam=2.0,
+        policy_entropy_weight=0.5,
+        total_steps=10 * line.steps_per_round,
+    )
+
+    def temperatures(**changes):
+        return np.asarray(train(config.replace(**changes)).curves["temperature"]) / config.reward_scale
+
+    paid = [1.0] * 6 + [1.0, 0.75, 0.5, 0.25]  # the weight of round 6 is whole: 4 of 10 rounds are left when it begins
+    np.testing.assert_allclose(temperatures(entropy_fade_share=0.4), 1.0 + np.asarray(paid), rtol=1e-5)
+    np.testing.assert_allclose(temperatures(entropy_fade_share=0.0), 2.0, rtol=1e-5)
+    np.testing.assert_allclose(temperatures(entropy_fade_share=0.4, lam=0.0), 1.0, rtol=1e-5)
+
+
 @pytest.mark.parametrize("method", ["peps", "oracle", "darc"])
 def test_what_the_human_watches_is_asked_about_and_reported(line, method):
     """Nothing else changes: the same is done, and seen by the agent. Who is told of every step watches all."""

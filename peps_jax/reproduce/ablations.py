@@ -20,6 +20,7 @@ def variants(base: Config) -> dict[str, tuple[str, dict[str, Any]]]:
         "PEPS": ("peps", {}),
         "without environment entropy": ("peps", {"environment_entropy_weight": 0.0}),
         "without policy entropy": ("peps", {"policy_entropy_weight": 0.0}),
+        "policy entropy whole to the end": ("peps", {"entropy_fade_share": 0.0}),
         "absolute entropies": ("peps", {"entropies": "absolute"}),
         "r̂'s 0.95 quantile at 0": ("peps", {"level": "quantile"}),
         "r̂'s maximum at 0": ("peps", {"level": "max"}),
