@@ -25,6 +25,7 @@ import jax
 import numpy as np
 from jax.experimental import serialize_executable
 
+from peps_jax.execution import machine
 from peps_jax.storage import code, files
 
 VARIABLE = "PEPS_JAX_CACHE"
@@ -152,10 +153,9 @@ def _processor() -> str:
 
 def _surroundings() -> list[str]:
     """What decides a program and isn't told by its maker."""
-    modules = ("jax", "jaxlib", "flax", "optax", "distrax", "chex", "numpy")
-    versions = [f"{name} {getattr(sys.modules.get(name), '__version__', None)}" for name in modules]
+    versions = [f"{name} {version}" for name, version in machine.versions().items()]
     device = jax.devices()[0]
-    machine = [platform.platform(), _processor(), device.platform, device.device_kind, device.client.platform_version]
+    here = [platform.platform(), _processor(), device.platform, device.device_kind, device.client.platform_version]
     settings = [f"{name} {value}" for name, value in sorted(jax.config.values.items())]
     flags = [os.environ.get(name, "") for name in ("XLA_FLAGS", "LIBTPU_INIT_ARGS")]
-    return [_code(), sys.version, *versions, *machine, *settings, *flags]
+    return [_code(), sys.version, *versions, *here, *settings, *flags]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.metadata
 import os
 import platform
@@ -11,7 +12,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -89,13 +91,19 @@ def _no_devices(told: Sequence[Exception], noise: Sequence[str], seconds: float)
     )
 
 
-def describe() -> dict[str, Any]:
-    """Versions of what computes, and the devices."""
-    versions = {"python": platform.python_version()}
+@functools.cache
+def versions() -> Mapping[str, str]:
+    """Versions of what computes, by its name."""
+    found = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
-            versions[package] = importlib.metadata.version(package)
+            found[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
-            versions[package] = "not installed"
+            found[package] = "not installed"
+    return MappingProxyType(found)
+
+
+def describe() -> dict[str, Any]:
+    """Versions of what computes, and the devices."""
     devices = [{"platform": device.platform, "kind": device.device_kind} for device in jax.devices()]
-    return {"versions": versions, "devices": devices}
+    return {"versions": dict(versions()), "devices": devices}

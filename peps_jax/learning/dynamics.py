@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import chex
-import distrax
 import jax
 import jax.numpy as jnp
 import optax
@@ -69,6 +68,8 @@ def _prediction(outputs: Array) -> Prediction:
 
 def loss(params: Any, transitions: Transition, settings: DynamicsSettings) -> Array:
     """One member's mean negative log-likelihood, in nats per transition and up to a constant of the units."""
+    import distrax  # takes half a second, which who doesn't train needn't wait
+
     prediction = predict(params, transitions.observation, transitions.action, settings)
     chex.assert_equal_shape([prediction.mean, transitions.movement])
     density = distrax.MultivariateNormalDiag(prediction.mean, jnp.exp(prediction.log_sd))

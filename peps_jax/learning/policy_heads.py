@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import chex
-import distrax
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from peps_jax.learning.networks import MLP, apply_ensemble
+
+if TYPE_CHECKING:
+    import distrax
 
 MIN_LOG_SD, MAX_LOG_SD = -5.0, 2.0
 
@@ -60,6 +62,8 @@ def gaussian(outputs: Array) -> Gaussian:
 
 def squashed(policy: Gaussian) -> distrax.Distribution:
     """tanh of a Gaussian: a distribution of actions in (-1, 1)^n."""
+    import distrax  # takes half a second, which who doesn't train needn't wait
+
     normal = distrax.MultivariateNormalDiag(policy.mean, jnp.exp(policy.log_sd))
     return distrax.Transformed(normal, distrax.Block(distrax.Tanh(), 1))
 
