@@ -31,11 +31,12 @@ FEW_SEEDS = 3  # at each lambda and number of answers beside the study's own
 # A scene pays about 7, where a way through navigation's maze pays about 100: entropies weigh less, rewards needn't be scaled.
 SETTINGS = dict(
     lam=2.0, gamma=0.99, num_envs=16, rollout_length=24, warmup_steps=1_920, updates_per_step=0.5,
-    hold_steps=2, reward_scale=0.25, policy_entropy_weight=0.02, entropy_fade_share=0.0, initial_temperature=2.0, temperature=0.01,
+    hold_steps=2, reward_scale=0.25, policy_entropy_weight=0.02, initial_temperature=2.0, temperature=0.01,
     segment_length=HORIZON, num_queries=1, surrogate_learning_rate=2e-3,  # nothing is asked: all was said before
     # answers are many, and r-hat is learned from them alone, as in the paper
     prior="none", surrogate_updates=40, exploration=0.2, critic_normalisation=False, learning_rate=1e-3, batch_size=256,
     product="gaussians",  # of discrete actions
+    entropy_fade_share=0.0,  # people watch the mode, and it weighs next to nothing
 )  # fmt: skip
 LAMS = (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)  # over which PEPS is shown
 EACH = (20, 50, 100, ANSWERS)  # answers of each participant, over which PEPS is shown
