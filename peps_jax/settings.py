@@ -231,7 +231,8 @@ def _perceived_size(problem: Problem) -> int:
 def _entropy_offset(config: Config, problem: Problem) -> Array | float:
     """What Eq. (6)'s entropies as they are defined are more per step than those against kernel and uniform policy.
 
-    H of the kernel, n/2 log(2 pi e) + sum_i log sigma_p,i, and H of the uniform policy.
+    H of the kernel, n/2 log(2 pi e) + sum_i log sigma_p,i, and H of the uniform policy. It keeps the policy entropy's whole
+    weight to the end: what a step pays stays as it is, only noise gets cheaper to leave out.
     """
     if config.entropies == "relative":
         return 0.0
