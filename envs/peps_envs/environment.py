@@ -129,14 +129,20 @@ class Environment(abc.ABC):
 
         Who can make steps under two parameter sets at once for less than two overrides this.
         """
-        after = self.step(key, state, action, params)
-        perceived = self.perceive(after.state)
         expects = lambda params: self.next_state_distribution(state, action, params)
         densities = jax.vmap(expects)(side_by_side(belief, params))  # both at once: a density stands once in a program
+        believed, true = (jax.tree.map(lambda rows, place=place: rows[place], densities) for place in range(2))
+        after = self.step_from(true, key, state, action, params)
+        perceived = self.perceive(after.state)
         log_belief, log_true = jax.vmap(lambda density: density.relative_log_prob(perceived))(densities)
-        imagined = jax.tree.map(lambda rows: rows[0], densities).sample(jax.random.fold_in(key, 1))
+        imagined = believed.sample(jax.random.fold_in(key, 1))
         human_reward = self.reward(state, action, after.state, belief)
         return after, Judgement(human_reward, log_belief, log_true, imagined)
+
+    def step_from(self, density: PerceivedDensity, key: Array, state: Any, action: Array, params: Any) -> Step:
+        """`step`, where the density of what it leads to is known: an environment whose steps are drawn from it overrides this."""
+        del density
+        return self.step(key, state, action, params)
 
     def judged_steps(
         self, keys: Array, states: Any, actions: Array, params: Any, belief: Any, watched: int

@@ -85,7 +85,8 @@ class Noise(NamedTuple):
 
 def draw_noise(key: Array, shape: tuple[int, ...], settings: AgentSettings) -> Noise:
     """For minibatches of shape `shape`."""
-    return Noise(*(head_of(settings).noise(key, shape) for key in jax.random.split(key)))
+    drawn = jax.vmap(lambda key: head_of(settings).noise(key, shape))(jax.random.split(key))  # compiled once
+    return Noise(*drawn)
 
 
 def agent_keys(key: Array, number: int) -> list[Array]:

@@ -28,12 +28,10 @@ def candidates(trajectory: Trajectory, key: Array, settings: QuerySettings) -> S
     """
     steps, watched_envs = trajectory.worth.shape[:2]
     shape = (settings.per_round * settings.candidates_per_query, 2)
-    key_env, key_start, key_length = jax.random.split(key, 3)
-    env = jax.random.randint(key_env, shape, 0, watched_envs, jnp.int32)[..., None]
-    start = jax.random.randint(key_start, shape, 0, steps - settings.segment_length + 1, jnp.int32)[..., None]
-    length = jax.random.randint(key_length, shape, settings.min_segment_length, settings.segment_length + 1, jnp.int32)[
-        ..., None
-    ]
+    first = jnp.array([0, 0, settings.min_segment_length], jnp.int32)
+    beyond = jnp.array([watched_envs, steps - settings.segment_length + 1, settings.segment_length + 1], jnp.int32)
+    draw = lambda key, first, beyond: jax.random.randint(key, shape, first, beyond, jnp.int32)
+    env, start, length = jax.vmap(draw)(jax.random.split(key, 3), first, beyond)[..., None]  # compiled once
     offset = jnp.arange(settings.segment_length)[None, None]
     cut = jax.tree.map(lambda rows: rows[start + offset, env], trajectory)
     over = cut.transition.terminated | cut.truncated

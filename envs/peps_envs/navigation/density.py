@@ -67,9 +67,9 @@ class NavigationDensity(PerceivedDensity):
         """
         params, width, noise = self.params, self.params.perception_width, self.noise
         low, high = free_interval(self.target, 0, params)
-        edges = jnp.sort(jnp.concatenate([params.walls[:, 0], params.walls[:, 2]]))
-        edges = jnp.clip(jnp.concatenate([low[None], edges, high[None]]), low, high)
-        start, end = edges[:-1], edges[1:]
+        edges = jnp.concatenate([low[None], params.walls[:, 0], params.walls[:, 2], high[None]])
+        edges = jnp.sort(jnp.clip(edges, low, high))
+        start, end, low, high = edges[:-1], edges[1:], edges[0], edges[-1]
         columns = jnp.concatenate([(start + end) / 2, jnp.stack([low, high])])  # x of each piece, and of both atoms
         limits = jax.vmap(lambda x: jnp.stack(free_interval(jnp.stack([x, self.target[1]]), 1, params)))(columns)
 

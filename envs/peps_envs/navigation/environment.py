@@ -58,7 +58,12 @@ class Navigation(Environment):
         return state, self.observe(state, params)
 
     def step(self, key: Array, state: NavigationState, action: Array, params: NavigationParams) -> Step:
-        position = self.next_state_distribution(state, action, params).move(key)
+        return self.step_from(self.next_state_distribution(state, action, params), key, state, action, params)
+
+    def step_from(
+        self, density: NavigationDensity, key: Array, state: NavigationState, action: Array, params: NavigationParams
+    ) -> Step:
+        position = density.move(key)
         next_state = NavigationState(position=position, time=state.time + 1)
         goal, pit = inside(position, params.goal), inside(position, params.pit)
         return Step(
