@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -115,13 +115,13 @@ def _draw(axes: Axes, points: Sequence[Line]) -> None:
     seen = lambda point: all(low <= point[score] <= high for score, (low, high) in limits.items())
     curve = sorted((point for point in points if point["method"] == "planner"), key=lambda point: point["lam"])
     places = np.array([[point[score] for score in SCORES] for point in curve])
-    axes.plot(*places.T, color=QUIET, linewidth=1.2, marker="D", markersize=3.5, label="planner", zorder=2)
+    axes.plot(*places.T, color=QUIET, linewidth=1.2, marker="D", markersize=3.5, label="planner over λ", zorder=2)
     hidden = []
     for method in ("peps", *BASELINES):
         own = [point for point in points if point["method"] == method]
         visible = [point for point in own if seen(point)]
         hidden += [point for point in own if not seen(point)]
-        label = TITLES[method]
+        label = TITLES[method] + (", and its λ" if method == "peps" else "")
         for point in visible:
             spread = [
                 [[point[score] - point[f"{score}_low"]], [point[f"{score}_high"] - point[score]]] for score in SCORES
@@ -135,9 +135,9 @@ def _draw(axes: Axes, points: Sequence[Line]) -> None:
             places = np.array([[point[score] for score in SCORES] for point in visible]).reshape(-1, 2)
             axes.plot(*places.T, color=colour_of(method), linewidth=1.0, alpha=0.6, zorder=2)
             sizes = [high - low for low, high in limits.values()]
-            for together in _at_one_place(places / sizes):
-                told = ", ".join(f"{visible[number]['lam']:g}" for number in together)
-                _note(axes, told, places[together[0]])
+            groups = _at_one_place(places / sizes)
+            told = [", ".join(f"{visible[number]['lam']:g}" for number in together) for together in groups]
+            _note(axes, told, places[[together[0] for together in groups]], places / sizes)
     for number, point in enumerate(hidden):
         lam = f" λ = {point['lam']:g}" if point["lam"] is not None else ""
         text = f"↙ {TITLES[point['method']]}{lam} ({point['return']:.0f}, {point['explicability']:.0f})"
@@ -157,5 +157,29 @@ def _at_one_place(places: np.ndarray) -> list[list[int]]:
     return groups
 
 
-def _note(axes: Axes, text: str, place: Any) -> None:
-    axes.annotate(text, place, (5, 5), textcoords="offset points", fontsize=7, color=INK)
+def _note(axes: Axes, texts: Sequence[str], places: np.ndarray, points: np.ndarray) -> None:
+    """Each text beside its place: where fewest of the texts before it and of the points, in shares of the axes, lie under it."""
+    limits = np.array([axes.get_xlim(), axes.get_ylim()])
+    taken = [(point, point) for point in points - limits[:, 0] / (limits[:, 1] - limits[:, 0])]
+    for text, place in zip(texts, places, strict=True):
+        at = (place - limits[:, 0]) / (limits[:, 1] - limits[:, 0])
+        boxes = [_box(at, text, right, above) for above in (True, False) for right in (True, False)]
+        crowd = [sum(_overlap(box, other) for other in taken) for box in boxes]
+        best = int(np.argmin(crowd))
+        right, above = best % 2 == 0, best < 2
+        taken.append(boxes[best])
+        axes.annotate(
+            text, place, (5 if right else -5, 5 if above else -5), textcoords="offset points", fontsize=7, color=INK,
+            ha="left" if right else "right", va="bottom" if above else "top",
+        )  # fmt: skip
+
+
+def _box(at: np.ndarray, text: str, right: bool, above: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Low and high corner of a text beside the place `at`, in shares of the axes."""
+    size = np.array([0.02 * len(text), 0.05])
+    low = at + np.where([right, above], 0.02, -0.02 - size)
+    return low, low + size
+
+
+def _overlap(box: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> bool:
+    return bool(np.all((box[0] <= other[1]) & (other[0] <= box[1])))
