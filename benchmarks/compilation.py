@@ -2,8 +2,9 @@
 
     python benchmarks/compilation.py [--envs nav-d1 mjx-box] [--methods peps sac] [--lines]
 
-Each method in a fresh process without any cache, in CPU-seconds, compiled as `jax.jit` does. `--lines` prints, of each program, the
-lines of StableHLO by the functions that they come from: with all that a function calls, and its own.
+Each method in fresh processes without any cache, in CPU-seconds: its programs as `jax.jit` compiles them, and all of them as a
+sweep does, which doesn't optimize what runs once. `--lines` prints, of each program, the lines of StableHLO by the functions that
+they come from: with all that a function calls, and its own.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import argparse
 import ast
 import collections
 import functools
+import importlib
 import itertools
 import os
 import pathlib
@@ -25,7 +27,7 @@ import jax
 import jax.numpy as jnp
 
 from peps_jax import Config
-from peps_jax.execution.program import advance, begin, roomy, score
+from peps_jax.execution.program import Program, advance, begin, roomy, score
 from peps_jax.storage.tables import markdown
 
 OUT = pathlib.Path(__file__).parent / "results" / "compilation.md"
@@ -63,6 +65,17 @@ def measure(env: str, method: str) -> list[list[str]]:
         lines, fusions = len(lowered.as_text().splitlines()), compiled.as_text().count(" fusion(")
         rows.append([env, method, name, f"{lines:,}", f"{fusions:,}", f"{between - start:.1f}", f"{end - between:.1f}"])
     return rows
+
+
+def measure_sweep(env: str, method: str) -> list[list[str]]:
+    """A row for all that a sweep compiles for a training: CPU-seconds from tracing on."""
+    program = Program(Config(env=env, method=method, total_steps=STEPS), 1, EPISODES, jax.devices()[:1])
+    start = seconds()
+    program.compile()
+    return [[env, method, "**all, by a sweep**", "", "", "", f"**{seconds() - start:.1f}**"]]
+
+
+MEASURED = {"programs": measure, "sweep": measure_sweep}
 
 
 # --- where lines come from ------------------------------------------------------------------------------------------------
@@ -112,15 +125,24 @@ def print_lines(env: str, method: str) -> None:
                 print(f"{number:7,} {function_name}")
 
 
+def in_a_fresh_process(env: str, method: str, what: str) -> list[list[str]]:
+    """The rows of one of `MEASURED`."""
+    command = [sys.executable, __file__, "--envs", env, "--methods", method, "--one", what]
+    environment = os.environ | {"PEPS_JAX_CACHE": "", "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, encoding="utf-8")
+    return [line.split("\t") for line in done.stdout.splitlines()]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--envs", nargs="+", default=["nav-d1", "mjx-box"])
     parser.add_argument("--methods", nargs="+", default=["peps", "sac"])
     parser.add_argument("--lines", action="store_true", help="print what programs are made of, and compile nothing")
-    parser.add_argument("--one", help=argparse.SUPPRESS)  # this process measures one method
+    parser.add_argument("--one", choices=list(MEASURED), help=argparse.SUPPRESS)  # this process measures one method's
     given = parser.parse_args()
     if given.one:
-        print("\n".join("\t".join(row) for row in measure(*given.envs, given.one)))
+        importlib.import_module("distrax")  # at a training's first sight of it, which isn't compilation
+        print("\n".join("\t".join(row) for row in MEASURED[given.one](*given.envs, *given.methods)))
         return
     asked = list(itertools.product(given.envs, given.methods))
     if given.lines:
@@ -129,12 +151,9 @@ def main() -> None:
         return
     rows = []
     for env, method in asked:
-        command = [sys.executable, __file__, "--envs", env, "--one", method]
-        environment = os.environ | {"PEPS_JAX_CACHE": "", "JAX_PLATFORMS": "cpu"}
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, encoding="utf-8")
-        found = [line.split("\t") for line in done.stdout.splitlines()]
+        found = in_a_fresh_process(env, method, "programs")
         sums = [f"**{sum(float(row[place]) for row in found):.1f}**" for place in (-2, -1)]
-        rows += [*found, [env, method, "**all**", "", "", *sums]]
+        rows += [*found, [env, method, "**all**", "", "", *sums], *in_a_fresh_process(env, method, "sweep")]
     head = [
         "task",
         "method",

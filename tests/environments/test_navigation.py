@@ -16,6 +16,7 @@ from navigation_cases import (
     actions,
     at,
     distribution,
+    minds,
     positions,
     property_of_all,
     seeds,
@@ -38,6 +39,22 @@ def wander(seed, position, drift, params):
 
     walk = lambda key: jax.lax.scan(move, at(position), jax.random.split(key, 25))[1]
     return jax.vmap(walk)(jax.random.split(jax.random.key(seed), 16))
+
+
+@jax.jit
+def judged_and_alone(seed, position, action, params, belief):
+    """Where 16 steps lead that are judged, and the same ones by themselves."""
+    state, keys = at(position), jax.random.split(jax.random.key(seed), 16)
+    judged = jax.vmap(lambda key: NAVIGATION.judged_step(key, state, action, params, belief)[0].state)(keys)
+    return judged, jax.vmap(lambda key: NAVIGATION.step(key, state, action, params).state)(keys)
+
+
+@property_of_all
+@given(positions(), minds, actions, seeds)
+def test_a_judged_step_is_the_true_one_whatever_is_believed(place, belief, action, seed):
+    params, start = place
+    judged, alone = judged_and_alone(seed, start, action, params, belief)
+    jax.tree.map(lambda *both: np.testing.assert_allclose(*both, atol=1e-5), judged, alone)
 
 
 @property_of_all

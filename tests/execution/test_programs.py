@@ -1,6 +1,7 @@
 """Compiled programs are found again by another process, and only by one that would make the same."""
 
 import dataclasses
+import gc
 import os
 import subprocess
 import sys
@@ -48,6 +49,24 @@ def test_what_was_made_is_found_again(place):
     assert found["double"](np.float32(3)) == 6
     assert found["beside"] == (1, "two")
     assert [path.suffix for path in place.iterdir()] == [".program"]
+
+
+@pytest.mark.parametrize("collects", [True, False])
+def test_garbage_is_collected_afterwards_as_before(place, collects):
+    before = gc.isenabled()
+    seen = []
+
+    def fail():
+        seen.append(gc.isenabled())
+        raise ValueError("no program")
+
+    try:
+        (gc.enable if collects else gc.disable)()
+        with pytest.raises(ValueError, match="no program"):
+            kept("a", fail)
+        assert (seen, gc.isenabled()) == ([False], collects)
+    finally:
+        (gc.enable if before else gc.disable)()
 
 
 BESIDE_JAX = """
