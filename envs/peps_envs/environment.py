@@ -131,11 +131,11 @@ class Environment(abc.ABC):
         """
         expects = lambda params: self.next_state_distribution(state, action, params)
         densities = jax.vmap(expects)(side_by_side(belief, params))  # both at once: a density stands once in a program
-        believed, true = (jax.tree.map(lambda rows, place=place: rows[place], densities) for place in range(2))
-        after = self.step_from(true, key, state, action, params)
+        density_of = lambda place: jax.tree.map(lambda rows: rows[place], densities)
+        after = self.step_from(density_of(1), key, state, action, params)
         perceived = self.perceive(after.state)
         log_belief, log_true = jax.vmap(lambda density: density.relative_log_prob(perceived))(densities)
-        imagined = believed.sample(jax.random.fold_in(key, 1))
+        imagined = density_of(0).sample(jax.random.fold_in(key, 1))
         human_reward = self.reward(state, action, after.state, belief)
         return after, Judgement(human_reward, log_belief, log_true, imagined)
 

@@ -134,10 +134,8 @@ def _draw(axes: Axes, points: Sequence[Line]) -> None:
         if method == "peps":
             places = np.array([[point[score] for score in SCORES] for point in visible]).reshape(-1, 2)
             axes.plot(*places.T, color=colour_of(method), linewidth=1.0, alpha=0.6, zorder=2)
-            sizes = [high - low for low, high in limits.values()]
-            groups = _at_one_place(places / sizes)
-            told = [", ".join(f"{visible[number]['lam']:g}" for number in together) for together in groups]
-            _note(axes, told, places[[together[0] for together in groups]], places / sizes)
+            low, high = np.array(list(limits.values())).T
+            _note(axes, [f"{point['lam']:g}" for point in visible], (places - low) / (high - low))
     for number, point in enumerate(hidden):
         lam = f" λ = {point['lam']:g}" if point["lam"] is not None else ""
         text = f"↙ {TITLES[point['method']]}{lam} ({point['return']:.0f}, {point['explicability']:.0f})"
@@ -157,20 +155,18 @@ def _at_one_place(places: np.ndarray) -> list[list[int]]:
     return groups
 
 
-def _note(axes: Axes, texts: Sequence[str], places: np.ndarray, points: np.ndarray) -> None:
-    """Each text beside its place: where fewest of the texts before it and of the points, in shares of the axes, lie under it."""
-    limits = np.array([axes.get_xlim(), axes.get_ylim()])
-    taken = [(point, point) for point in points - limits[:, 0] / (limits[:, 1] - limits[:, 0])]
-    for text, place in zip(texts, places, strict=True):
-        at = (place - limits[:, 0]) / (limits[:, 1] - limits[:, 0])
-        boxes = [_box(at, text, right, above) for above in (True, False) for right in (True, False)]
-        crowd = [sum(_overlap(box, other) for other in taken) for box in boxes]
-        best = int(np.argmin(crowd))
-        right, above = best % 2 == 0, best < 2
-        taken.append(boxes[best])
+def _note(axes: Axes, texts: Sequence[str], places: np.ndarray) -> None:
+    """Texts beside their places (n, 2), in shares of the axes: where fewest places and texts before lie under them."""
+    taken = [(place, place) for place in places]
+    for together in _at_one_place(places):
+        text, place = ", ".join(texts[number] for number in together), places[together[0]]
+        sides = [(right, above) for above in (True, False) for right in (True, False)]
+        crowd = [sum(_overlap(_box(place, text, *side), other) for other in taken) for side in sides]
+        right, above = sides[int(np.argmin(crowd))]
+        taken.append(_box(place, text, right, above))
         axes.annotate(
-            text, place, (5 if right else -5, 5 if above else -5), textcoords="offset points", fontsize=7, color=INK,
-            ha="left" if right else "right", va="bottom" if above else "top",
+            text, place, (5 if right else -5, 5 if above else -5), xycoords="axes fraction", textcoords="offset points",
+            fontsize=7, color=INK, ha="left" if right else "right", va="bottom" if above else "top",
         )  # fmt: skip
 
 

@@ -67,6 +67,7 @@ class NavigationDensity(PerceivedDensity):
         """
         params, width, noise = self.params, self.params.perception_width, self.noise
         low, high = free_interval(self.target, 0, params)
+        # what was sorted is read where it is needed; low and high as they are would be computed again at every place
         edges = jnp.concatenate([low[None], params.walls[:, 0], params.walls[:, 2], high[None]])
         edges = jnp.sort(jnp.clip(edges, low, high))
         start, end, low, high = edges[:-1], edges[1:], edges[0], edges[-1]
