@@ -68,7 +68,7 @@ def parts(structure: Config) -> dict[str, Callable[[Prepared, Config], Any]]:
 
     def ask(given: Prepared, config: Config) -> Any:
         training = train.prepare(config)
-        segments = training.method.ask(given.state.knowledge, given.trajectory, key, training.settings)
+        segments = training.method.ask(given.state.knowledge, given.trajectory, now(given, training), training.settings)
         unasked, room = training.settings.queries.unasked_rounds, training.settings.queries.room
         _, queries = data.ask(given.state.preferences, segments, index, unasked, room, given.state.budget)
         return training.answer(key, queries, training.problem, training.settings.human)

@@ -108,8 +108,7 @@ def evaluate_policy(
     """`num_episodes` episodes of `policy` in `problem`, scored for a human who believes its belief."""
     environment, params = problem.environment, problem.params
 
-    def step(carry: tuple[Any, Array, Array], key: Array) -> tuple[tuple[Any, Array, Array], Any]:
-        state, observation, alive = carry
+    def step(state: Any, observation: Array, alive: Array, key: Array) -> tuple[tuple[Any, Array, Array], Any]:
         key_act, key_env = jax.random.split(key)
         action, log_policy = policy(observation, key_act if stochastic else None)
         after, score, _ = explicability.judged_step(problem, key_env, state, action)
@@ -120,19 +119,19 @@ def evaluate_policy(
         row = jax.tree.map(lambda values: jnp.where(alive, values, jnp.zeros_like(values)), row)
         return (next_state, next_observation, still), (row, environment.perceive(next_state))
 
-    def episode(key: Array) -> Evaluation:
-        key_reset, key_steps = jax.random.split(key)
-        state, observation = environment.reset(key_reset, params)
-        keys = jax.random.split(key_steps, environment.horizon)
-        _, (rows, places) = jax.lax.scan(step, (state, observation, jnp.ones((), bool)), keys)
-        score, log_policy, length = jax.tree.map(lambda values: jnp.sum(values, 0), rows[:3])
-        events = jnp.any(rows[3], 0)
-        return Evaluation(
-            score=score,
-            log_policy=log_policy,
-            length=length,
-            events={name: events[i] for i, name in enumerate(environment.event_names)},
-            perceived=jnp.concatenate([environment.perceive(state)[None], places]).astype(jnp.float32),
-        )
-
-    return jax.vmap(episode)(jax.random.split(key, num_episodes))
+    key_reset, key_steps = jnp.moveaxis(jax.vmap(jax.random.split)(jax.random.split(key, num_episodes)), 1, 0)
+    state, observation = jax.vmap(environment.reset, in_axes=(0, None))(key_reset, params)
+    keys = jax.vmap(lambda key: jax.random.split(key, environment.horizon), out_axes=1)(key_steps)
+    # steps of all episodes, rather than all steps of an episode: a batch of scans would be traced three times
+    together = lambda carry, keys: jax.vmap(step)(*carry, keys)
+    _, (rows, places) = jax.lax.scan(together, (state, observation, jnp.ones(num_episodes, bool)), keys)
+    score, log_policy, length = jax.tree.map(lambda values: jnp.sum(values, 0), rows[:3])
+    events = jnp.any(rows[3], 0)
+    places = jnp.concatenate([jax.vmap(environment.perceive)(state)[None], places])
+    return Evaluation(
+        score=score,
+        log_policy=log_policy,
+        length=length,
+        events={name: events[:, place] for place, name in enumerate(environment.event_names)},
+        perceived=jnp.moveaxis(places, 0, 1).astype(jnp.float32),
+    )

@@ -12,13 +12,13 @@ from peps_jax.settings import ScheduleSettings
 
 
 class RoundKeys(NamedTuple):
-    """Random keys of a round, by purpose."""
+    """Random keys of a round, by purpose; (3,) where one purpose has several uses."""
 
-    act: Array
-    ask: Array
-    answer: Array
-    learn: Array
-    improve: Array
+    act: Array  # (3,)
+    ask: Array  # (3,)
+    answer: Array  # ()
+    learn: Array  # (3,)
+    improve: Array  # (3,)
 
 
 class Round(NamedTuple):
@@ -39,7 +39,7 @@ def round_at(index: Array, key: Array, schedule: ScheduleSettings) -> Round:
     position = index * schedule.steps_per_round
     return Round(
         index=index,
-        keys=RoundKeys(*jax.random.split(jax.random.fold_in(key, index), len(RoundKeys._fields))),
+        keys=_keys(jax.random.fold_in(key, index)),
         explores_only=index < schedule.warmup_rounds,
         position=position,
         filled=position + schedule.steps_per_round,
@@ -49,6 +49,12 @@ def round_at(index: Array, key: Array, schedule: ScheduleSettings) -> Round:
         # what the objective pays for noise serves learning; whoever acts by samples in the end pays for it
         policy_entropy=faded(index, schedule.entropy_fade_share, schedule).astype(jnp.float32),
     )
+
+
+def _keys(key: Array) -> RoundKeys:
+    purposes = RoundKeys(*jax.random.split(key, len(RoundKeys._fields)))
+    uses = RoundKeys(*jax.vmap(lambda key: jax.random.split(key, 3))(jnp.stack(purposes)))  # compiled once
+    return uses._replace(answer=purposes.answer)
 
 
 def annealed_temperature(index: Array, schedule: ScheduleSettings) -> Array:

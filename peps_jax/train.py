@@ -158,7 +158,7 @@ def collect_and_ask(
 ) -> tuple[TrainingState, Queries | None, dict[str, Array]]:
     """The first half of a round: act, remember, and choose what to ask. Queries are None of a method that asks nothing."""
     settings, method = training.settings, training.method
-    key_act, key_hold = jax.random.split(now.keys.act)
+    key_act, key_hold, _ = now.keys.act
     agent = settings.agent.replace(temperature=now.temperature)
     behave = lambda observation, key: method.behave(state.agents, observation, key, agent)
     act = rollout.exploring(behave, settings.agent.action_space, now.explores_only, key_hold, settings.rollout)
@@ -167,7 +167,7 @@ def collect_and_ask(
     state = state.replace(actors=actors, replay=replay.add(state.replay, flat, now.position))
     if not method.asks:
         return state, None, info
-    segments = method.ask(state.knowledge, trajectory, now.keys.ask, settings)
+    segments = method.ask(state.knowledge, trajectory, now, settings)
     unasked, room = settings.queries.unasked_rounds, settings.queries.room
     preferences, queries = data.ask(state.preferences, segments, now.index, unasked, room, state.budget)
     return state.replace(preferences=preferences), queries, info
@@ -191,7 +191,7 @@ def learn_and_improve(state: TrainingState, now: Round, training: Training) -> t
 def improve(state: TrainingState, now: Round, training: Training) -> tuple[tuple[sac.Agent, ...], dict[str, Array]]:
     """SAC updates of one round: every agent sees the same minibatches, with its own reward by what the method knows now."""
     method, settings = training.method, training.settings
-    key_batch, key_update = jax.random.split(now.keys.improve)
+    key_batch, key_update, _ = now.keys.improve
     shape = (settings.agent.updates, settings.agent.batch_size)
     index = replay.draw(key_batch, shape, now.filled)
     batches = replay.rows(state.replay, index)

@@ -29,6 +29,15 @@ def test_hash():
     np.testing.assert_array_equal(found.T, [hash_in_integers(map(int, column)) for column in words.T])
 
 
+@pytest.mark.parametrize(("first", "beyond"), [(0, 1), (0, 17), (3, 20_000), (-5, 2**20 + 7)])
+def test_integers_are_those_of_jax(first, beyond):
+    key, shape = generator.key(3), (4, 500)
+    expected = jax.random.randint(key, shape, first, beyond, jnp.int32)
+    found = generator.integers(key, shape, jnp.asarray(first), jnp.asarray(beyond))
+    assert found.dtype == jnp.int32
+    np.testing.assert_array_equal(found, expected)
+
+
 def streams() -> dict[str, np.ndarray]:
     """Words (n,) as a training draws them: many from one key, and one from each of many keys."""
     key, number = generator.key(7), jnp.arange(NUMBER)

@@ -237,12 +237,13 @@ class Program:
         """The programs by name, not compiled yet."""
         leaves = self._shapes(stack([self._config] * self._slots))
         recorded = self._recorded
-        state = self._shapes(jax.eval_shape(jax.vmap(begin, in_axes=(0, None)), leaves, recorded))
         over = lambda function, **which: devices.over_devices(function, self._devices, **which)
         span = jax.ShapeDtypeStruct((2,), jnp.int32)
         evaluation = lambda state, config: score(state, config, self._num_episodes)
+        first = over(begin, whole=(1,)).lower(leaves, recorded)
+        state = self._shapes(first.out_info)
         return {
-            "init": over(begin, whole=(1,)).lower(leaves, recorded),
+            "init": first,
             "rounds": over(advance, whole=(1,), donate=(0,)).lower(state, span, leaves),
             "evaluate": over(evaluation).lower(state, leaves),
         }

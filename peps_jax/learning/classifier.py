@@ -59,10 +59,10 @@ def loss(params: Any, transitions: Transition, noise: Array, settings: DynamicsS
 
 
 def fit(
-    state: ClassifierState, buffer: Transition, filled: Array, key: Array, settings: DynamicsSettings
+    state: ClassifierState, buffer: Transition, filled: Array, keys: Array, settings: DynamicsSettings
 ) -> tuple[ClassifierState, dict[str, Array]]:
     """`settings.updates` steps of Adam; each member draws minibatches of its own from the `filled` rows of replay."""
-    key_batch, key_noise = jax.random.split(key)
+    key_batch, key_noise = keys
     shape = (settings.updates, settings.ensemble_size, settings.batch_size)
     batches = replay.sample(buffer, key_batch, shape, filled)
     noises = jax.random.normal(key_noise, batches.movement.shape, jnp.float32)

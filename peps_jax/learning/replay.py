@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from peps_envs import ActionSpace, Discrete
+from peps_jax import generator
 from peps_jax.trajectory import Transition
 
 
@@ -56,7 +57,7 @@ def sample(buffer: Transition, key: Array, shape: tuple[int, ...], filled: Array
 
 def draw(key: Array, shape: tuple[int, ...], filled: Array) -> Array:
     """Which rows `sample` takes, (*shape)."""
-    return jax.random.randint(key, shape, 0, filled)
+    return generator.integers(key, shape, 0, filled)
 
 
 def rows(buffer: Transition, index: Array) -> Transition:

@@ -39,7 +39,7 @@ def learn(
     knowledge: Knowledge, buffer: Transition, preferences: PreferenceSet | None, now: Round, settings: Settings
 ) -> tuple[Knowledge, dict[str, Array]]:
     """The classifier from replay."""
-    state, info = classifier.fit(knowledge.classifier, buffer, now.filled, now.keys.learn, settings.dynamics)
+    state, info = classifier.fit(knowledge.classifier, buffer, now.filled, now.keys.learn[:2], settings.dynamics)
     return Knowledge(classifier=state), info
 
 

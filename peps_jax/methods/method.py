@@ -37,8 +37,8 @@ class Method(NamedTuple):
     acts_in: Callable[[Problem], Problem] = lambda problem: problem  # for learning and for evaluation
     settings: Callable[[Settings], Settings] = lambda settings: settings  # what the method has its own way
     init: Callable[[Array, Settings], Any] = lambda key, settings: ()  # (key, settings) -> knowledge
-    # (knowledge, trajectory, key, settings) -> pairs of segments (n, 2, steps, ...) for the teacher; called if it asks
-    ask: Callable[[Any, Trajectory, Array, Settings], Segments] | None = None
+    # (knowledge, trajectory, round, settings) -> pairs of segments (n, 2, steps, ...) for the teacher; called if it asks
+    ask: Callable[[Any, Trajectory, Round, Settings], Segments] | None = None
     # (knowledge, replay, preferences known by now, round, settings) -> knowledge, info
     learn: Callable[[Any, Transition, PreferenceSet | None, Round, Settings], tuple[Any, dict[str, Array]]] = (
         lambda knowledge, replay, preferences, now, settings: (knowledge, {})

@@ -35,7 +35,7 @@ def learn(
     knowledge: Knowledge, buffer: Transition, preferences: PreferenceSet | None, now: Round, settings: Settings
 ) -> tuple[Knowledge, dict[str, Array]]:
     """T_A from replay, as PEPS learns it."""
-    key = jax.random.split(now.keys.learn, 3)[0]
+    key, *_ = now.keys.learn
     state, info = dynamics.fit(knowledge.dynamics, buffer, now.filled, key, settings.dynamics)
     return Knowledge(dynamics=state), info
 

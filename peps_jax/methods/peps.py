@@ -38,7 +38,7 @@ def learn(
     knowledge: Knowledge, buffer: Transition, preferences: PreferenceSet, now: Round, settings: Settings
 ) -> tuple[Knowledge, dict[str, Array]]:
     """Lines 4-8 of Algorithm 1: T_A from replay, r_hat from the preferences given so far."""
-    key_dynamics, _, key_surrogate = jax.random.split(now.keys.learn, 3)
+    key_dynamics, _, key_surrogate = now.keys.learn
     dynamics_state, dynamics_info = dynamics.fit(
         knowledge.dynamics, buffer, now.filled, key_dynamics, settings.dynamics
     )

@@ -30,9 +30,9 @@ def init(key: Array, settings: Settings) -> Knowledge:
     return Knowledge(surrogate=surrogate.init(key, settings.surrogate))
 
 
-def ask(knowledge: Knowledge, trajectory: Trajectory, key: Array, settings: Settings) -> Segments:
+def ask(knowledge: Knowledge, trajectory: Trajectory, now: Round, settings: Settings) -> Segments:
     """The queries of this round: of the latest trajectories' pairs, those from which the ensemble learns most."""
-    key_candidates, key_choose = jax.random.split(key)
+    key_candidates, key_choose, _ = now.keys.ask
     pairs = queries.candidates(trajectory, key_candidates, settings.queries)
     logits = surrogate.preference_logits(knowledge.surrogate, pairs, settings.surrogate)
     chosen = queries.choose(logits, queries.describe(pairs), key_choose, settings.queries)
@@ -53,7 +53,7 @@ def learn(
     knowledge: Knowledge, buffer: Transition, preferences: PreferenceSet, now: Round, settings: Settings
 ) -> tuple[Knowledge, dict[str, Array]]:
     """Learns r-hat alone."""
-    _, key = jax.random.split(now.keys.learn)
+    _, key, _ = now.keys.learn
     state, info = fit_surrogate(knowledge.surrogate, buffer, preferences, now.filled, key, settings)
     return Knowledge(surrogate=state), info
 

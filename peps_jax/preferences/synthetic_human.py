@@ -58,14 +58,15 @@ def segment_values(segments: Segments, problem: Problem, settings: HumanSettings
 
 def answer(key: Array, queries: Queries, problem: Problem, settings: HumanSettings) -> Answers:
     """The synthetic human's answers to `queries`."""
-    key_choice, key_mistake = jax.random.split(key)
-    chance = lambda key: jax.random.uniform(key, queries.number.shape, jnp.float32)
+    keys = jnp.stack([jax.random.fold_in(key, 1), *jax.random.split(key)])
+    draw = lambda key: jax.random.uniform(key, queries.number.shape, jnp.float32)
+    of_knowing, of_choice, of_mistake = jax.vmap(draw)(keys)  # compiled once
     both = segment_values(queries.segments, problem, settings)  # (queries, 2, 2)
-    knows = chance(jax.random.fold_in(key, 1)) < settings.informed
+    knows = of_knowing < settings.informed
     values = jnp.where(knows[:, None], both[..., 1], both[..., 0])  # (queries, 2)
     difference = values[:, 0] - values[:, 1]
-    first = chance(key_choice) < jax.nn.sigmoid(settings.rationality * difference)
-    mistaken = chance(key_mistake) < settings.mistake_rate
+    first = of_choice < jax.nn.sigmoid(settings.rationality * difference)
+    mistaken = of_mistake < settings.mistake_rate
     choice = jnp.where(first ^ mistaken, 1.0, 0.0)
     return Answers(
         number=queries.number,

@@ -28,7 +28,7 @@ def fitted(line, shift, rounds=12):
     own = settings(line.replace(dynamics_updates=100, dynamics_learning_rate=5e-3, model_hidden_sizes=(16,))).dynamics
     rows = transitions(jax.random.key(0), shift)
     state = classifier.init(jax.random.key(1), own)
-    fit = jax.jit(lambda state, key: classifier.fit(state, rows, jnp.asarray(ROWS), key, own))
+    fit = jax.jit(lambda state, key: classifier.fit(state, rows, jnp.asarray(ROWS), jax.random.split(key), own))
     for index in range(rounds):
         state, info = fit(state, jax.random.key(index))
     return state, rows, own, float(info["classifier_loss"])
