@@ -21,11 +21,11 @@ label: $(READY)
 	$(BIN)/python -m peps_jax.human_study label $(ARGS)
 
 test: $(READY)
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal --durations 10 $(ARGS)
+	$(BIN)/python -m pytest -n logical --maxprocesses 4 --dist worksteal --durations 10 $(ARGS)
 
 # those that take a minute or more each
 test-long: $(READY)
-	$(BIN)/python -m pytest -m long -n auto --maxprocesses 4 --dist worksteal --durations 10 $(ARGS)
+	$(BIN)/python -m pytest -m long -n logical --maxprocesses 4 --dist worksteal --durations 10 $(ARGS)
 
 # the pages under docs/ and the API's reference as a site in site/; a warning is an error
 docs: $(READY)

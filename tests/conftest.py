@@ -38,12 +38,6 @@ keep_what_is_compiled()
 gc.set_threshold(100_000, 20, 50)  # tracing makes many objects, and hardly any garbage that refers to itself
 
 
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers() -> int:
-    """One more than there are cores: tests wait for servers and for other processes."""
-    return (os.cpu_count() or 1) + 1
-
-
 def pytest_collection_finish() -> None:
     """What was imported stays: the garbage collector doesn't look through it again and again."""
     gc.freeze()
