@@ -119,7 +119,7 @@ def evaluate_policy(
         row = jax.tree.map(lambda values: jnp.where(alive, values, jnp.zeros_like(values)), row)
         return (next_state, next_observation, still), (row, environment.perceive(next_state))
 
-    key_reset, key_steps = jnp.moveaxis(jax.vmap(jax.random.split)(jax.random.split(key, num_episodes)), 1, 0)
+    key_reset, key_steps = jax.vmap(jax.random.split, out_axes=1)(jax.random.split(key, num_episodes))
     state, observation = jax.vmap(environment.reset, in_axes=(0, None))(key_reset, params)
     keys = jax.vmap(lambda key: jax.random.split(key, environment.horizon), out_axes=1)(key_steps)
     # steps of all episodes, rather than all steps of an episode: a batch of scans would be traced three times

@@ -61,7 +61,10 @@ def loss(params: Any, transitions: Transition, noise: Array, settings: DynamicsS
 def fit(
     state: ClassifierState, buffer: Transition, filled: Array, keys: Array, settings: DynamicsSettings
 ) -> tuple[ClassifierState, dict[str, Array]]:
-    """`settings.updates` steps of Adam; each member draws minibatches of its own from the `filled` rows of replay."""
+    """`settings.updates` steps of Adam; each member draws minibatches of its own from the `filled` rows of replay.
+
+    `keys` (2,): of the minibatches and of the kernel's noise.
+    """
     key_batch, key_noise = keys
     shape = (settings.updates, settings.ensemble_size, settings.batch_size)
     batches = replay.sample(buffer, key_batch, shape, filled)

@@ -30,6 +30,7 @@ def candidates(trajectory: Trajectory, key: Array, settings: QuerySettings) -> S
     shape = (settings.per_round * settings.candidates_per_query, 2)
     first = jnp.array([0, 0, settings.min_segment_length], jnp.int32)
     beyond = jnp.array([watched_envs, steps - settings.segment_length + 1, settings.segment_length + 1], jnp.int32)
+    # `generator.integers` would be compiled into every gather below, which nearly doubles a training's compilation
     draw = lambda key, first, beyond: jax.random.randint(key, shape, first, beyond, jnp.int32)
     env, start, length = jax.vmap(draw)(jax.random.split(key, 3), first, beyond)[..., None]  # compiled once
     offset = jnp.arange(settings.segment_length)[None, None]
